@@ -1,0 +1,155 @@
+import drjit as dr
+import mitsuba as mi
+
+from sira_mi.fields.appearance import (
+    albedo_refinement_cooperative,
+    deform_cooperative,
+    diffuse_albedo_cooperative,
+    specular_albedo_cooperative,
+)
+from sira_mi.fields.mlp import layers, pack
+from sira_mi.models.avatar import load_avatar
+
+
+class NeuralAlbedo(mi.Texture):
+    r"""
+    .. _texture-neural_albedo:
+
+    Neural albedo (`neural_albedo`)
+    -------------------------------
+
+    .. pluginparameters::
+
+     * - avatar
+       - |string|
+       - An `avatar.safetensors`; empty for the mean head of the shipped prior. (Default: empty)
+     * - kind
+       - |string|
+       - `diffuse` (three channels, eqs 9a and 11) or `specular` (one channel, eq. 9b). (Default: `diffuse`)
+     * - weights
+       - |Float|
+       - Flat parameters of the albedo network.
+       - |exposed|, |differentiable|
+     * - latent
+       - |Float|
+       - z_a of the diffuse, z_s of the specular albedo.
+       - |exposed|, |differentiable|
+     * - refinement
+       - |Float|
+       - Flat parameters of the refinement network a^r (`diffuse` only).
+       - |exposed|, |differentiable|
+     * - k_r
+       - |Float|
+       - Weight of the refinement, eq. 11 (`diffuse` only). (Default: the avatar's)
+       - |exposed|, |differentiable|
+
+    The albedo is a neural field over SIRA's reference space: the surface point is first mapped by the deformation
+    network to x_ref and the features γ. Inside the BSDF of a `neural_sdf`, deformation, latent and transform are that
+    shape's own, so that they follow its updates and receive its gradients; anywhere else they are the avatar's.
+
+    Works inside any stock BSDF and in symbolic loops: networks are evaluated as cooperative vectors. Call
+    `params.update()` after gradients are enabled. The three-channel texture gives its luminance where one channel is
+    asked for; the one-channel texture gives grey where three are.
+
+    Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
+
+    .. tabs::
+        .. code-tab:: python
+
+            'type': 'principled',
+            'base_color': {'type': 'neural_albedo', 'avatar': 'avatar/avatar.safetensors'}
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        avatar = load_avatar(props.get("avatar", ""))
+        self.kind = props.get("kind", "diffuse")
+        if self.kind not in ("diffuse", "specular"):
+            raise ValueError(f"neural_albedo: kind is '{self.kind}', must be 'diffuse' or 'specular'")
+        tensors = avatar.tensors
+        self.weights = mi.Float(tensors[f"{self.kind}_albedo"])
+        self.latent = mi.Float(tensors["z_a" if self.kind == "diffuse" else "z_s"])
+        self.refinement = mi.Float(tensors["albedo_refinement"])
+        self.k_r = mi.Float(avatar.k_r)
+        self.architecture = avatar.architecture
+        self._pack()
+        self.bind(avatar.architecture, mi.Float(tensors["deformation"]), mi.Float(tensors["z_sdf"]), mi.Transform4f())
+
+    def bind(self, architecture, deformation, z_sdf, to_local) -> None:
+        """Takes the reference space from a shape: its deformation network (flat parameters), its latent, and the
+        transform from world to the field's coordinates."""
+        column = mi.TensorXf(z_sdf, (len(z_sdf), 1))
+        self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
+        self._to_local = to_local
+
+    def network(self):
+        """The albedo network's layers at the current parameters, for evaluation on tensors."""
+        column = mi.TensorXf(self.latent, (len(self.latent), 1))
+        return layers(self.architecture.networks[f"{self.kind}_albedo"], self.weights, column)
+
+    def refinement_network(self):
+        """The refinement network's layers at the current parameters, for evaluation on tensors."""
+        return layers(self.architecture.networks["albedo_refinement"], self.refinement)
+
+    def is_refined(self) -> bool:
+        """Whether the refinement takes part: its weight is not zero, or is being optimised."""
+        return self._packed_refinement is not None
+
+    def _pack(self) -> None:
+        self._packed = pack(self.network())
+        refined = self.kind == "diffuse" and (dr.grad_enabled(self.k_r) or self.k_r.numpy().item() != 0)
+        self._packed_refinement = pack(self.refinement_network()) if refined else None
+        self._attached = self._gradients()
+
+    def _gradients(self) -> tuple[bool, ...]:
+        return tuple(dr.grad_enabled(p) for p in (self.weights, self.latent, self.refinement, self.k_r))
+
+    def _evaluate(self, si) -> list:
+        """The albedo at a surface interaction: three Floats (diffuse) or one (specular)."""
+        if any(now and not then for now, then in zip(self._gradients(), self._attached, strict=True)):
+            raise RuntimeError("neural_albedo: gradients were enabled after the last update; call params.update() first")
+        a = self.architecture
+        x_ref, gamma = deform_cooperative(self._deformation, a.sdf_octaves, list(self._to_local @ si.p))
+        if self.kind == "specular":
+            return specular_albedo_cooperative(self._packed, a.specular_octaves, x_ref)
+        base = diffuse_albedo_cooperative(self._packed, a.albedo_octaves, x_ref, gamma)
+        if self._packed_refinement is None:
+            return base
+        fine = albedo_refinement_cooperative(self._packed_refinement, a.refinement_octaves, x_ref, gamma)
+        return [dr.minimum(dr.maximum(b + self.k_r * r, 0.0), 1.0) for b, r in zip(base, fine, strict=True)]
+
+    def eval(self, si, active=True):
+        albedo = self._evaluate(si)
+        return mi.Color3f(*albedo if len(albedo) == 3 else albedo * 3) & active
+
+    def eval_3(self, si, active=True):
+        return self.eval(si, active)
+
+    def eval_1(self, si, active=True):
+        albedo = self._evaluate(si)
+        return (albedo[0] if len(albedo) == 1 else mi.luminance(mi.Color3f(*albedo))) & active
+
+    def mean(self):
+        return mi.Float(0.5)
+
+    def max(self):
+        return 1.0
+
+    def is_spatially_varying(self):
+        return True
+
+    def traverse(self, callback):
+        callback.put("weights", self.weights, mi.ParamFlags.Differentiable)
+        callback.put("latent", self.latent, mi.ParamFlags.Differentiable)
+        if self.kind == "diffuse":
+            callback.put("refinement", self.refinement, mi.ParamFlags.Differentiable)
+            callback.put("k_r", self.k_r, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()):
+        self._pack()
+
+    def to_string(self):
+        return f"NeuralAlbedo[kind = {self.kind}]"
+
+
+mi.register_texture("neural_albedo", lambda props: NeuralAlbedo(props))

@@ -1,0 +1,141 @@
+"""The emitter `sg_envmap`: an environment of spherical Gaussians."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.errors import InputError
+from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
+from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
+from sira_mi.sg.sampling import LobeMixture
+
+# Distance of the environment in scene units; a Python emitter is not told the size of its scene.
+FAR_DISTANCE = 1e5
+# Dim and near-constant: the light when no lobes are given.
+DEFAULT_LOBES = ((0.0, 1.0, 0.0, 1e-3, 0.2, 0.2, 0.2),)
+
+
+class SGEnvmap(mi.Emitter):
+    r"""Environment of spherical Gaussians (:monosp:`sg_envmap`)
+    -----------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - lobes
+       - |tensor|
+       - N_l × 7: axis (3, any length but zero), sharpness λ > 0, linear RGB amplitude (3, not negative). 1 to 4096 lobes.
+         (Default: one near-constant lobe of radiance 0.2)
+       - |exposed|, |differentiable|
+
+     * - filename
+       - |string|
+       - A `.json` file `{"lobes": [{"axis": [x, y, z], "sharpness": λ, "amplitude": [r, g, b]}, ...]}`, or a
+         latitude-longitude `.exr`, to which `lobe_count` lobes are fitted. Excludes `lobes`.
+
+     * - lobe_count
+       - |int|
+       - Lobes that are fitted to an `.exr`. (Default: 64)
+
+     * - scale
+       - |float|
+       - Factor of the radiance. (Default: 1)
+       - |exposed|, |differentiable|
+
+     * - to_world
+       - |transform|
+       - Rotation of the environment. (Default: none)
+
+    The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)); Mitsuba's `envmap` of the same light shows it in the same
+    directions. Light is sampled by choosing a lobe by the luminance of its energy and a direction from its von
+    Mises-Fisher density; the density is that of the whole mixture.
+
+    It does not emit rays (`sample_ray`): particle tracers such as `ptracer` cannot use it. It needs an RGB or
+    monochrome variant, and scenes much smaller than 1e5 units, the distance at which it places its light. Derivatives
+    go through the radiance, not through the sampling. Inside Mitsuba's symbolic loops the gradients of `lobes` are summed
+    by atomic additions: their last bits vary from run to run.
+
+    Source: the light model of eq. 8 of SIRA (Caselles et al. 2023), after PhySG (Zhang et al. 2021).
+
+    .. code-block:: python
+
+        "light": {
+            "type": "sg_envmap",
+            "lobes": mi.TensorXf([[0, 1, 0, 2.0, 0.5, 0.6, 0.8], [0.6, 0.5, 0.6, 80.0, 9.0, 8.0, 7.0]]),
+        }
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        if mi.is_spectral or mi.is_polarized:
+            raise InputError("sg_envmap works in RGB and monochrome variants, such as llvm_ad_rgb")
+        self.m_flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.SpatiallyVarying
+        self.scale = mi.Float(props.get("scale", 1.0))
+        count = props.get("lobe_count", 64)
+        if props.has_property("lobes") and props.has_property("filename"):
+            raise InputError("sg_envmap: give either lobes or filename, not both")
+        if props.has_property("filename"):
+            lobes = self._read(props["filename"], count)
+        else:
+            lobes = check_lobes(np.array(props.get("lobes", mi.TensorXf(DEFAULT_LOBES))), "sg_envmap")
+        self.lobes = mi.TensorXf(lobes)
+        self._prepare()
+
+    @staticmethod
+    def _read(filename, count):
+        path = mi.file_resolver().resolve(filename)
+        suffix = path.extension().lower()
+        path = str(path)
+        if suffix == ".json":
+            return read_lights(path)
+        if suffix == ".exr":
+            if not 1 <= count <= 4096:
+                raise InputError(f"sg_envmap: lobe_count is {count}; it must be 1 to 4096")
+            return fit_environment(read_environment(path), EnvironmentFit(lobes=count))
+        raise InputError(f"{path}: sg_envmap reads .json and .exr files")
+
+    def _prepare(self):
+        self.mixture = LobeMixture(self.lobes)
+
+    def traverse(self, callback):
+        callback.put("lobes", self.lobes, mi.ParamFlags.Differentiable)
+        callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()):
+        if not keys or "lobes" in keys:
+            self._prepare()
+
+    def _evaluate(self, direction):
+        """Radiance and sampling density of a world direction."""
+        radiance, pdf = self.mixture.evaluate(self.world_transform().inverse() @ direction)
+        radiance = radiance * self.scale
+        return mi.Spectrum(mi.luminance(radiance)) if mi.is_monochromatic else radiance, pdf
+
+    def eval(self, si, active=True):
+        return self._evaluate(-si.wi)[0] & active
+
+    def sample_direction(self, it, sample, active=True):
+        direction = dr.normalize(self.world_transform() @ self.mixture.sample(sample, active))
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p = dr.fma(direction, FAR_DISTANCE, it.p)
+        ds.n, ds.d, ds.dist = -direction, direction, mi.Float(FAR_DISTANCE)
+        ds.uv, ds.time, ds.delta = mi.Point2f(0.0), it.time, mi.Bool(False)
+        ds.emitter = mi.EmitterPtr(self)
+        radiance, pdf = self._evaluate(direction)
+        ds.pdf = dr.select(active, pdf, 0.0)
+        active &= pdf > 0.0
+        return ds, dr.select(active, radiance / dr.select(pdf > 0.0, pdf, 1.0), 0.0)
+
+    def pdf_direction(self, it, ds, active=True):
+        return dr.select(active, self._evaluate(ds.d)[1], 0.0)
+
+    def eval_direction(self, it, ds, active=True):
+        return self._evaluate(ds.d)[0] & active
+
+    def bbox(self):
+        return mi.ScalarBoundingBox3f()
+
+    def to_string(self):
+        return f"SGEnvmap[lobes = {self.mixture.count}, scale = {self.scale}]"
+
+
+mi.register_emitter("sg_envmap", lambda props: SGEnvmap(props))

@@ -1,0 +1,158 @@
+"""The BSDF `sira_bsdf`: diffuse albedo and the simplified Disney specular term of eq. 8."""
+
+import drjit as dr
+import mitsuba as mi
+
+from sira_mi.errors import InputError
+from sira_mi.sg import brdf
+
+
+class SiraBSDF(mi.BSDF):
+    r"""Reflectance of eq. 8 (:monosp:`sira_bsdf`)
+    ---------------------------------------------
+
+    .. pluginparameters::
+
+     * - diffuse_albedo
+       - |spectrum| or |texture|
+       - Diffuse albedo a. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+     * - specular_albedo
+       - |float| or |texture|
+       - Specular albedo s, one channel: the reflectance at normal incidence. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+     * - roughness
+       - |float|
+       - r, from 0.05 to 1. (Default: 0.5)
+       - |exposed|, |differentiable|
+
+     * - k_s
+       - |float|
+       - Weight of the specular term, not negative. (Default: 1)
+       - |exposed|, |differentiable|
+
+    f = a/π + k_s D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴), F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h}
+    and Schlick-Smith's G with k = (r + 1)²/8: the formulas of `sira_mi.sg.brdf`, the same as in closed-form shading.
+
+    One-sided; nest it in `twosided` for both. It is reciprocal. It does not conserve energy: the diffuse term is not
+    reduced by what the specular term reflects, nor is the specular term normalised at grazing angles; with a = 0 and
+    s = 1 the model itself reflects more than it receives, and this plugin neither adds to that nor hides it.
+    Directions are sampled from a mixture of the cosine lobe and the reflected normal distribution.
+
+    Source: SIRA (Caselles et al. 2023), eq. 8, after PhySG (Zhang et al. 2021) and Karis, "Real Shading in Unreal
+    Engine 4" (2013).
+
+    .. code-block:: python
+
+        "bsdf": {
+            "type": "sira_bsdf",
+            "diffuse_albedo": {"type": "rgb", "value": [0.6, 0.4, 0.3]},
+            "specular_albedo": 0.375,
+            "roughness": 0.5,
+        }
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.diffuse_albedo = self._texture(props, "diffuse_albedo")
+        self.specular_albedo = self._texture(props, "specular_albedo")
+        roughness, k_s = float(props.get("roughness", 0.5)), float(props.get("k_s", 1.0))
+        if not brdf.MINIMUM_ROUGHNESS <= roughness <= brdf.MAXIMUM_ROUGHNESS:
+            raise InputError(f"sira_bsdf: roughness is {roughness}; it must be 0.05 to 1")
+        if not 0.0 <= k_s < float("inf"):
+            raise InputError(f"sira_bsdf: k_s is {k_s}; it must be finite and not negative")
+        self.roughness, self.k_s = mi.Float(roughness), mi.Float(k_s)
+        side = mi.BSDFFlags.FrontSide
+        if any(texture.is_spatially_varying() for texture in (self.diffuse_albedo, self.specular_albedo)):
+            side = side | mi.BSDFFlags.SpatiallyVarying
+        self.m_components = [mi.BSDFFlags.GlossyReflection | side, mi.BSDFFlags.DiffuseReflection | side]
+        self.m_flags = self.m_components[0] | self.m_components[1]
+
+    @staticmethod
+    def _texture(props, name):
+        if hasattr(props, "get_texture"):
+            return props.get_texture(name, 0.5)
+        value = props.get(name, 0.5)
+        return value if isinstance(value, mi.Texture) else mi.load_dict({"type": "uniform", "value": float(value)})
+
+    def traverse(self, callback):
+        callback.put("diffuse_albedo", self.diffuse_albedo, mi.ParamFlags.Differentiable)
+        callback.put("specular_albedo", self.specular_albedo, mi.ParamFlags.Differentiable)
+        callback.put("roughness", self.roughness, mi.ParamFlags.Differentiable)
+        callback.put("k_s", self.k_s, mi.ParamFlags.Differentiable)
+
+    def _components(self, ctx, active):
+        glossy = mi.Bool(ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))
+        return glossy & active, mi.Bool(ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)) & active
+
+    def _glossy_share(self, ctx, si, active):
+        """Probability of sampling the specular lobe, by a rough estimate of the two albedos; detached."""
+        with dr.suspend_grad():
+            diffuse = dr.mean(self.diffuse_albedo.eval(si, active))
+            weight = self.k_s * brdf.fresnel(self.specular_albedo.eval_1(si, active), mi.Frame3f.cos_theta(si.wi))
+            share = dr.clip(weight / dr.maximum(weight + diffuse, 1e-6), 0.1, 0.9)
+            if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
+                share = mi.Float(1.0)
+            if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
+                share = mi.Float(0.0)
+            return share
+
+    def _value(self, ctx, si, wo, active):
+        """f · cos of the light direction."""
+        cos_light = mi.Frame3f.cos_theta(wo)
+        active &= (mi.Frame3f.cos_theta(si.wi) > 0.0) & (cos_light > 0.0)
+        glossy, diffuse = self._components(ctx, active)
+        specular = brdf.specular_brdf(
+            mi.Vector3f(0, 0, 1), si.wi, wo, self.specular_albedo.eval_1(si, active), self.roughness
+        )
+        value = dr.select(diffuse, self.diffuse_albedo.eval(si, active) * dr.inv_pi, 0.0)
+        return dr.select(active, (value + dr.select(glossy, self.k_s * specular, 0.0)) * cos_light, 0.0)
+
+    def _density(self, ctx, si, wo, active):
+        with dr.suspend_grad():
+            active &= (mi.Frame3f.cos_theta(si.wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0)
+            glossy = brdf.reflected_density(mi.Vector3f(0, 0, 1), si.wi, wo, self.roughness)
+            share = self._glossy_share(ctx, si, active)
+            return dr.select(active, dr.lerp(mi.warp.square_to_cosine_hemisphere_pdf(wo), glossy, share), 0.0)
+
+    def sample(self, ctx, si, sample1, sample2, active=True):
+        active &= mi.Frame3f.cos_theta(si.wi) > 0.0
+        share = self._glossy_share(ctx, si, active)
+        glossy = sample1 < share
+        with dr.suspend_grad():
+            half = brdf.sample_distribution(sample2, self.roughness)
+            wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
+        bs = dr.zeros(mi.BSDFSample3f)
+        bs.wo = wo
+        bs.pdf = self._density(ctx, si, wo, active)
+        bs.eta = 1.0
+        bs.sampled_component = dr.select(glossy, mi.UInt32(0), mi.UInt32(1))
+        bs.sampled_type = dr.select(
+            glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+        )
+        active &= bs.pdf > 0.0
+        value = self._value(ctx, si, wo, active) / dr.select(active, bs.pdf, 1.0)
+        return bs, dr.select(active, value, 0.0)
+
+    def eval(self, ctx, si, wo, active=True):
+        return self._value(ctx, si, wo, active)
+
+    def pdf(self, ctx, si, wo, active=True):
+        return self._density(ctx, si, wo, active)
+
+    def eval_pdf(self, ctx, si, wo, active=True):
+        return self._value(ctx, si, wo, active), self._density(ctx, si, wo, active)
+
+    def eval_diffuse_reflectance(self, si, active=True):
+        return self.diffuse_albedo.eval(si, active) & active
+
+    def to_string(self):
+        return (
+            f"SiraBSDF[\n  diffuse_albedo = {self.diffuse_albedo},\n  specular_albedo = {self.specular_albedo},\n"
+            f"  roughness = {self.roughness},\n  k_s = {self.k_s}\n]"
+        )
+
+
+mi.register_bsdf("sira_bsdf", lambda props: SiraBSDF(props))

@@ -1,0 +1,121 @@
+"""One random light a scene, as a latitude-longitude radiance map: spherical-Gaussian lamps, an HDRI, or sun and sky.
+
+Maps are [H, 2H, 3] linear radiance in Mitsuba's frame: u = atan2(x, -z) / 2π, v = acos(y) / π.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.conventions import LUMINANCE
+from sira_mi.errors import InputError
+
+MAP_HEIGHT = 128
+SKY_TURBIDITY = (2.0, 8.0)
+
+
+@cache
+def map_directions(height: int) -> np.ndarray:
+    """Unit directions [H, 2H, 3] of the pixel centres."""
+    v = (np.arange(height) + 0.5) / height
+    u = (np.arange(2 * height) + 0.5) / (2 * height)
+    phi, theta = np.meshgrid(2 * np.pi * u, np.pi * v)
+    return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+
+
+def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndarray, dict]:
+    """A radiance map of arbitrary scale and its description (JSON types; lobes are given for SG lights)."""
+    kinds = ("sg", "sky", "hdri") if hdri else ("sg", "sky")
+    shares = (0.4, 0.2, 0.4) if hdri else (0.65, 0.35)
+    kind = random.choice(kinds, p=shares)
+    if kind == "sg":
+        lobes = sample_lobes(random)
+        return lobe_map(lobes), {"kind": "sg", "lobes": lobes.tolist()}
+    if kind == "sky":
+        return sky_map(random)
+    path = hdri[random.integers(len(hdri))]
+    turn = float(random.uniform(0, 1))
+    image = read_map(path)
+    return np.roll(image, round(turn * image.shape[1]), axis=1), {"kind": "hdri", "file": path.name, "turn": turn}
+
+
+def sample_lobes(random: np.random.Generator) -> np.ndarray:
+    """Lobes [N, 7] of axis, sharpness and RGB amplitude: a wide ambient one, a key light mostly from the front half,
+    often a fill and a rim light, of plausible lamp colours."""
+    lobes = [np.concatenate([[0.0, 1.0, 0.0], [random.uniform(0.2, 1.0)], _tint(random, 0.25) * random.uniform(0.1, 0.5)])]
+    key = random.uniform(8, 40)
+    lobes.append(_lobe(random, (-75, 75), (-5, 65), key, _tint(random, 0.35) * random.uniform(0.5, 1.0) * key * 0.12))
+    if random.random() < 0.7:
+        fill = random.uniform(2, 12)
+        lobes.append(_lobe(random, (-120, 120), (-25, 50), fill, _tint(random, 0.4) * random.uniform(0.1, 0.5)))
+    if random.random() < 0.4:
+        rim = random.uniform(15, 60)
+        lobes.append(_lobe(random, (120, 240), (0, 60), rim, _tint(random, 0.5) * random.uniform(0.1, 0.8) * rim * 0.08))
+    return np.array(lobes)
+
+
+def _lobe(random, yaw, elevation, sharpness, amplitude):
+    a, e = np.radians(random.uniform(*yaw)), np.radians(random.uniform(*elevation))
+    return np.concatenate([[np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)], [sharpness], amplitude])
+
+
+def _tint(random, strength):
+    """A lamp colour [3] of luminance 1 between warm and cool."""
+    warmth = random.uniform(-strength, strength)
+    colour = np.array([1 + warmth, 1 + 0.15 * random.uniform(-strength, strength), 1 - warmth])
+    return colour / (colour @ np.array(LUMINANCE))
+
+
+def lobe_map(lobes: np.ndarray, height: int = MAP_HEIGHT) -> np.ndarray:
+    """Radiance [H, 2H, 3] of lobes [N, 7]: the sum of amplitude · exp(sharpness (axis · direction − 1))."""
+    cosine = map_directions(height) @ lobes[:, :3].T
+    return np.exp(lobes[:, 3] * (cosine - 1)) @ lobes[:, 4:]
+
+
+def sky_map(random: np.random.Generator) -> tuple[np.ndarray, dict]:
+    """Mitsuba's sun and sky with the sun mostly in front, over grey ground."""
+    azimuth, elevation = random.uniform(-110, 110), random.uniform(12, 65)
+    turbidity, sun = random.uniform(*SKY_TURBIDITY), random.uniform(0.0, 0.6) ** 2
+    a, e = np.radians(azimuth), np.radians(elevation)
+    towards = [np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)]
+    emitter = mi.load_dict(
+        {
+            "type": "sunsky",
+            "sun_direction": [towards[0], -towards[2], towards[1]],
+            "turbidity": float(turbidity),
+            "sun_scale": 0.0,
+            "albedo": 0.3,
+        }
+    )
+    directions = map_directions(MAP_HEIGHT)
+    # The plug-in's frame has +z up: its direction is ours turned by a quarter about x.
+    local = np.stack([directions[..., 0], -directions[..., 2], directions[..., 1]], -1).reshape(-1, 3)
+    interaction = mi.SurfaceInteraction3f()
+    interaction.wi = mi.Vector3f(-local.T.astype(np.float32))
+    image = np.array(emitter.eval(interaction)).T.reshape(directions.shape).astype(np.float64)
+    image = np.maximum(np.nan_to_num(image), 0)
+    upper = image[directions[..., 1] > 0].mean(0)
+    image[directions[..., 1] <= 0] = 0.2 * upper
+    sharpness = 600.0
+    disk = np.exp(sharpness * (directions @ np.array(towards) - 1))
+    warm = np.array([1.0, 0.9 - 0.25 * np.exp(-elevation / 15), 0.8 - 0.55 * np.exp(-elevation / 15)])
+    # Ratio of sun to sky irradiance: 0 overcast to about 6.
+    strength = 18 * sun
+    image += disk[..., None] * warm * strength * (upper @ np.array(LUMINANCE)) * np.pi / (2 * np.pi / sharpness)
+    info = {"kind": "sky", "azimuth": azimuth, "elevation": elevation, "turbidity": turbidity, "sun": strength}
+    return image, {key: value if isinstance(value, str) else float(value) for key, value in info.items()}
+
+
+@cache
+def read_map(path: Path) -> np.ndarray:
+    """An HDRI [128, 256, 3], area-averaged to the working size; Poly Haven's maps fit the frame as they are."""
+    try:
+        image = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+    except Exception as error:
+        raise InputError(f"{path}: not a readable environment map ({error})") from None
+    if image.ndim != 3 or not np.isfinite(image).all():
+        raise InputError(f"{path}: not a finite RGB environment map")
+    return cv2.resize(np.maximum(image, 0), (2 * MAP_HEIGHT, MAP_HEIGHT), interpolation=cv2.INTER_AREA).astype(float)

@@ -1,0 +1,99 @@
+"""The decoders of appearance: rendering function (eq. 4), albedos (eqs 9a, 9b, 11) and illumination.
+
+Tensors are `[rows, N]`, one column a surface point; the `_cooperative` forms take and return lists of Floats and serve
+symbolic code. Radiance is linear; albedos lie in [0, 1].
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fields.encoding import encode, encode_cooperative
+from sira_mi.fields.mlp import evaluate, evaluate_cooperative
+
+# Bounds of the illumination decoder: log-sharpness and log-amplitude of a lobe, and its initial sharpness.
+LOG_SHARPNESS = (-1.0, 5.5)
+LOG_AMPLITUDE = (-9.0, 7.0)
+INITIAL_SHARPNESS = 8.0
+
+
+def _logistic(a):
+    return dr.rcp(1.0 + dr.exp(-a))
+
+
+def rendered_radiance(network: list[tuple], octaves: int, x_ref, normal, view, gamma):
+    """Eq. 4, r(x_ref, n, v, γ) [3, N]: `normal` and `view` (the unit direction in which the ray travels) are [3, N],
+    γ is [N_γ, N]. The output is exponential, hence positive and unbounded."""
+    h = evaluate(network, dr.concat([encode(x_ref, octaves), normal, view, gamma], axis=0))
+    return dr.exp(dr.minimum(h, 4.0))
+
+
+def diffuse_albedo(network: list[tuple], octaves: int, x_ref, gamma):
+    """Eq. 9a: base diffuse albedo [3, N]."""
+    return _logistic(evaluate(network, dr.concat([encode(x_ref, octaves), gamma], axis=0)))
+
+
+def specular_albedo(network: list[tuple], octaves: int, x_ref):
+    """Eq. 9b: monochrome specular albedo [1, N]."""
+    return _logistic(evaluate(network, encode(x_ref, octaves)))
+
+
+def albedo_refinement(network: list[tuple], octaves: int, x_ref, gamma):
+    """The refinement field a^r [3, N] of eq. 11, in [-1, 1]."""
+    return dr.tanh(evaluate(network, dr.concat([encode(x_ref, octaves), gamma], axis=0)))
+
+
+def refined_albedo(base, refinement, k_r):
+    """Eq. 11, a + k_r a^r, kept within [0, 1]."""
+    return dr.minimum(dr.maximum(base + k_r * refinement, 0.0), 1.0)
+
+
+def diffuse_albedo_cooperative(packed, octaves: int, x_ref: list, gamma: list) -> list:
+    """`diffuse_albedo` in symbolic code."""
+    return [_logistic(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves) + gamma)]
+
+
+def specular_albedo_cooperative(packed, octaves: int, x_ref: list) -> list:
+    """`specular_albedo` in symbolic code."""
+    return [_logistic(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves))]
+
+
+def albedo_refinement_cooperative(packed, octaves: int, x_ref: list, gamma: list) -> list:
+    """`albedo_refinement` in symbolic code."""
+    return [dr.tanh(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves) + gamma)]
+
+
+def deform_cooperative(packed, octaves: int, x: list) -> tuple[list, list]:
+    """Eqs 1 and 2a in symbolic code: three Floats -> (x_ref as three Floats, γ as N_γ Floats)."""
+    h = [mi.Float(a) for a in evaluate_cooperative(packed, encode_cooperative(x, octaves))]
+    return [a + d for a, d in zip(x, h[:3], strict=True)], h[3:]
+
+
+def fibonacci_directions(count: int) -> np.ndarray:
+    """`count` unit vectors [count, 3] spread evenly over the sphere."""
+    k = np.arange(count) + 0.5
+    y = 1 - 2 * k / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - y * y)
+    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1).astype(np.float32)
+
+
+def illumination(network: list[tuple], latent):
+    """Illumination decoder: z_l [dim, S] -> lobes [N_l, 7, S] (axis, sharpness, RGB amplitude), offsets from evenly
+    spread lobes; sharpness and amplitude are bounded exponentials, so that no latent leads to an infinite light."""
+    h = evaluate(network, latent)
+    count, scenes = h.shape[0] // 7, h.shape[1]
+    h = dr.reshape(h, (count, 7, scenes))
+    base = mi.TensorXf(np.repeat(fibonacci_directions(count)[:, :, None], scenes, axis=2))
+    axis = base + h[:, 0:3, :]
+    square = axis * axis
+    axis = axis / dr.sqrt(square[:, 0:1, :] + square[:, 1:2, :] + square[:, 2:3, :] + 1e-8)
+    sharpness = dr.exp(_bounded(h[:, 3:4, :] + float(np.log(INITIAL_SHARPNESS)), *LOG_SHARPNESS))
+    amplitude = dr.exp(_bounded(h[:, 4:7, :] - 1.0, *LOG_AMPLITUDE))
+    return dr.concat([axis, sharpness, amplitude], axis=1)
+
+
+def _bounded(a, lower: float, upper: float):
+    """Smooth clamp that is close to the identity in the middle of its range."""
+    centre, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    return centre + half * dr.tanh((a - centre) / half)

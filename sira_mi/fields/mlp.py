@@ -1,0 +1,167 @@
+"""Multilayer perceptrons, written once and evaluated two ways.
+
+A network is a flat parameter vector with an `Architecture`. `layers` unpacks it, together with a latent, into plain
+weight matrices and biases: the latent only shifts the bias of every hidden layer, so that a decoder conditioned on a
+latent costs no more per point than one without. The layers are then evaluated on
+
+- tensors `[features, N]` (`evaluate`, `evaluate_with_tangents`): one matrix product a layer, for batches of points;
+- cooperative vectors (`pack`, `evaluate_cooperative`): inside symbolic code such as textures, where tensor `@` is
+  not available.
+
+The hidden activation is a softplus with β = 100 (IDR, Yariv et al. 2020).
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit import nn
+
+SOFTPLUS_SHARPNESS = 100.0
+_LOG2_E = 1.4426950408889634
+_MAXIMUM_PARAMETERS = 4_000_000
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of a network: `inputs` features (already encoded) -> `depth` hidden layers `width` wide -> `outputs`."""
+
+    inputs: int
+    outputs: int
+    width: int
+    depth: int
+    latent: int = 0  # dimension of the latent that shifts every hidden layer; 0 for none
+
+    def __post_init__(self):
+        sizes = (self.inputs, self.outputs, self.width, self.depth)
+        if min(sizes) < 1 or self.latent < 0 or self.parameters > _MAXIMUM_PARAMETERS:
+            raise ValueError(f"unusable network sizes: {self}")
+
+    def shapes(self) -> list[tuple[tuple[int, int], tuple[int, int], tuple[int, int]]]:
+        """Per layer the shapes of its weight [out, in], bias [out, 1] and latent matrix [out, latent]; the output
+        layer has an empty latent matrix."""
+        sizes = [self.inputs] + [self.width] * self.depth + [self.outputs]
+        return [
+            ((o, i), (o, 1), (o, self.latent if k < self.depth else 0))
+            for k, (i, o) in enumerate(zip(sizes[:-1], sizes[1:], strict=True))
+        ]
+
+    @property
+    def parameters(self) -> int:
+        """Length of the flat parameter vector."""
+        return sum(a * b for layer in self.shapes() for a, b in layer)
+
+
+def initial_parameters(architecture: Architecture, rng: np.random.Generator, output_scale: float = 1.0) -> np.ndarray:
+    """Flat parameters [architecture.parameters] float32: He-normal weights, zero biases, latent matrices N(0, 1/latent);
+    the output weights are scaled by `output_scale`."""
+    pieces = []
+    for k, (weight, bias, latent) in enumerate(architecture.shapes()):
+        scale = output_scale if k == architecture.depth else 1.0
+        pieces.append(rng.standard_normal(weight).ravel() * np.sqrt(2 / weight[1]) * scale)
+        pieces.append(np.zeros(bias).ravel())
+        pieces.append(rng.standard_normal(latent).ravel() / np.sqrt(max(latent[1], 1)))
+    return np.concatenate(pieces).astype(np.float32)
+
+
+class _AddBias(dr.CustomOp):
+    """h [W, S·n] + b [W, S], each of the S columns of b for n consecutive points.
+
+    The adjoint of b is an axis sum: the one of Dr.Jit's broadcast is an atomic scatter, whose result varies from run
+    to run."""
+
+    def eval(self, h, b):
+        self.bias_shape = b.shape
+        rows, columns = b.shape
+        shape = h.shape
+        if columns == 1:
+            return h + b
+        return dr.reshape(dr.reshape(h, (rows, columns, -1)) + dr.reshape(b, (rows, columns, 1)), shape)
+
+    def forward(self):
+        self.set_grad_out(self.eval(self.grad_in("h"), self.grad_in("b")))
+
+    def backward(self):
+        gradient = self.grad_out()
+        rows, columns = self.bias_shape
+        self.set_grad_in("h", gradient)
+        total = dr.sum(dr.reshape(gradient, (rows, columns, -1)), axis=2)
+        self.set_grad_in("b", type(gradient)(total.array, (rows, columns)))
+
+
+def layers(architecture: Architecture, parameters, latent=None) -> list[tuple]:
+    """Unpacks flat `parameters` (Float [architecture.parameters]) into [(weight [out, in], bias [out, S]), ...].
+
+    `latent` is a tensor [architecture.latent, S]: one column for every scene of a batch, or None for zeros.
+    Differentiable in both."""
+    result, offset = [], 0
+
+    def take(shape):
+        nonlocal offset
+        size = shape[0] * shape[1]
+        index = dr.arange(mi.UInt32, size) + offset
+        offset += size
+        return mi.TensorXf(dr.gather(mi.Float, parameters, index), shape)
+
+    for weight_shape, bias_shape, latent_shape in architecture.shapes():
+        weight, bias = take(weight_shape), take(bias_shape)
+        if latent_shape[1] > 0:
+            shift = take(latent_shape)
+            if latent is not None:
+                bias = dr.custom(_AddBias, shift @ latent, bias)
+        result.append((weight, bias))
+    return result
+
+
+def _softplus(a):
+    """Softplus with β = 100, on tensors and cooperative vectors alike, without overflow."""
+    e = dr.exp2(dr.maximum(a, a * -1.0) * (-SOFTPLUS_SHARPNESS * _LOG2_E))
+    return dr.maximum(a, 0.0) + dr.log2(e + 1.0) * (1.0 / (SOFTPLUS_SHARPNESS * _LOG2_E))
+
+
+def _softplus_slope(a):
+    """Derivative of `_softplus`: the logistic function of β a, without overflow."""
+    e = dr.exp2(-dr.abs(a) * (SOFTPLUS_SHARPNESS * _LOG2_E))
+    r = dr.rcp(e + 1.0)
+    return dr.select(a >= 0.0, r, e * r)
+
+
+def evaluate(network: list[tuple], h):
+    """Tensor mode: features [inputs, N] -> outputs [outputs, N]. With S latents, N is a multiple of S and the points
+    of one latent are consecutive."""
+    for k, (weight, bias) in enumerate(network):
+        h = dr.custom(_AddBias, weight @ h, bias)
+        if k + 1 < len(network):
+            h = _softplus(h)
+    return h
+
+
+def evaluate_with_tangents(network: list[tuple], h, tangents: list):
+    """`evaluate`, carrying directional derivatives [inputs, N] of the features along: returns the outputs and their
+    derivatives [outputs, N]. Dr.Jit has no second-order AD, so a gradient that a loss depends on is primal code."""
+    for k, (weight, bias) in enumerate(network):
+        h = dr.custom(_AddBias, weight @ h, bias)
+        tangents = [weight @ t for t in tangents]
+        if k + 1 < len(network):
+            slope = _softplus_slope(h)
+            h = _softplus(h)
+            tangents = [t * slope for t in tangents]
+    return h, tangents
+
+
+def pack(network: list[tuple]) -> list[tuple]:
+    """Packs layers with one latent for `evaluate_cooperative`; differentiable."""
+    matrices = [m for weight, bias in network for m in (weight, mi.TensorXf(bias.array, (bias.shape[0],)))]
+    packed = nn.pack(*matrices, layout="training")
+    return list(zip(packed[0::2], packed[1::2], strict=True))
+
+
+def evaluate_cooperative(packed: list[tuple], features: list) -> list:
+    """Cooperative-vector mode, usable in symbolic code: a list of `inputs` Floats -> a list of `outputs` Floats."""
+    h = nn.CoopVec(*features)
+    for k, (weight, bias) in enumerate(packed):
+        h = nn.matvec(weight, h, bias)
+        if k + 1 < len(packed):
+            h = _softplus(h)
+    return list(h)

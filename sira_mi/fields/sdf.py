@@ -1,0 +1,111 @@
+"""The composed signed distance field, eqs 1-3: a deformation into reference space, then a reference SDF.
+
+All functions work on tensors `[rows, N]`, one column a point, coordinates in scene units.
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fields.encoding import encode, encode_with_tangents
+from sira_mi.fields.mlp import Architecture, evaluate, evaluate_with_tangents
+
+# Points evaluated at once where no gradient is recorded; bounds the memory of dense evaluations.
+CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class SdfField:
+    """The unpacked layers of both networks, the deformation's conditioned on z_sdf."""
+
+    deformation: list[tuple]
+    reference: list[tuple]
+    octaves: int  # of the positional encoding of x and of x_ref
+
+
+def sphere_parameters(architecture: Architecture, rng: np.random.Generator, radius: float) -> np.ndarray:
+    """Geometric initialisation (Atzmon & Lipman 2020, as in IDR): flat parameters of a network whose value is close
+    to |x| − radius; `radius` in scene units."""
+    pieces = []
+    for k, (weight, bias, latent) in enumerate(architecture.shapes()):
+        if k < architecture.depth:
+            matrix = rng.standard_normal(weight) * np.sqrt(2 / weight[0])
+            if k == 0:
+                matrix[:, 3:] = 0
+            offset = np.zeros(bias)
+        else:
+            matrix = np.sqrt(np.pi / weight[1]) + 1e-4 * rng.standard_normal(weight)
+            offset = np.full(bias, -radius)
+        pieces += [matrix.ravel(), offset.ravel(), np.zeros(latent).ravel()]
+    return np.concatenate(pieces).astype(np.float32)
+
+
+def _split(deformation):
+    """Outputs of the deformation network [3 + N_γ, N] -> (δ [3, N], γ [N_γ, N])."""
+    return deformation[:3, :], deformation[3:, :]
+
+
+def deform(field: SdfField, x):
+    """Eqs 1 and 2a: x [3, N] -> (x_ref = x + δ [3, N], γ [N_γ, N])."""
+    delta, gamma = _split(evaluate(field.deformation, encode(x, field.octaves)))
+    return x + delta, gamma
+
+
+def signed_distance(field: SdfField, x):
+    """Eq. 3: x [3, N] -> signed distance [1, N], negative inside."""
+    x_ref, _ = deform(field, x)
+    return evaluate(field.reference, encode(x_ref, field.octaves))
+
+
+def _with_tangents(field: SdfField, x, tangents: list):
+    h, t = encode_with_tangents(x, tangents, field.octaves)
+    h, t = evaluate_with_tangents(field.deformation, h, t)
+    delta, gamma = _split(h)
+    x_ref = x + delta
+    h, t = encode_with_tangents(x_ref, [a + _split(b)[0] for a, b in zip(tangents, t, strict=True)], field.octaves)
+    value, slopes = evaluate_with_tangents(field.reference, h, t)
+    return value, slopes, x_ref, gamma
+
+
+def signed_distance_and_slope(field: SdfField, x, direction):
+    """Signed distance [1, N] and its derivative [1, N] along `direction` [3, N]."""
+    value, (slope,), _, _ = _with_tangents(field, x, [direction])
+    return value, slope
+
+
+def surface(field: SdfField, x):
+    """x [3, N] -> (signed distance [1, N], ∇f [3, N], x_ref [3, N], γ [N_γ, N]); ∇f is primal code, so that losses
+    on it (eikonal, normals, shading) can be differentiated."""
+    basis = np.eye(3, dtype=np.float32)
+    n = x.shape[1]
+    axes = [mi.TensorXf(np.repeat(basis[:, k : k + 1], n, axis=1)) for k in range(3)]
+    value, slopes, x_ref, gamma = _with_tangents(field, x, axes)
+    return value, dr.concat(slopes, axis=0), x_ref, gamma
+
+
+def normalised(v):
+    """Columns of v [3, N] scaled to unit length; columns shorter than 1e-6 stay finite."""
+    square = v * v
+    length = dr.sqrt(square[0:1, :] + square[1:2, :] + square[2:3, :] + 1e-12)
+    return v / length
+
+
+def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Applies `function` (tensors [rows, n] -> tensor or tuple of tensors) to the columns of `arrays` [rows, N],
+    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Every chunk has the same size, so that
+    one kernel serves all."""
+    n = arrays[0].shape[1]
+    parts = []
+    with dr.suspend_grad():
+        for start in range(0, n, CHUNK):
+            piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
+            count = piece[0].shape[1]
+            if n > CHUNK and count < CHUNK:
+                piece = [np.pad(p, ((0, 0), (0, CHUNK - count)), mode="edge") for p in piece]
+            result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
+            result = result if isinstance(result, tuple) else (result,)
+            dr.eval(*result)
+            parts.append([r.numpy()[:, :count] for r in result])
+    return [np.concatenate(column, axis=1) for column in zip(*parts, strict=True)]

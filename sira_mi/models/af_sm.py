@@ -1,0 +1,189 @@
+"""AF-SM, the appearance factorization model: self-supervised auto-decoder training, eq. 10 (section 3.1.4).
+
+It sees the images only, never the true albedo. Points enter through the frozen deformation of a trained SA-SM."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.columns import from_columns, to_columns
+from sira_mi.fields.mlp import initial_parameters, layers
+from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, surface
+from sira_mi.models import losses
+from sira_mi.models.avatar import AvatarArchitecture
+from sira_mi.models.scenes import TrainingScene
+from sira_mi.sg.shading import shade
+
+NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
+LATENTS = ("z_a", "z_s", "z_l")
+
+
+@dataclass(frozen=True)
+class AppearanceTraining:
+    """Settings of the AF-SM training; λ as in eq. 10."""
+
+    steps: int = 4000
+    scenes: int = 8  # scenes a step
+    points: int = 512  # a scene and step
+    learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
+    latent_rate: float = 4e-3  # of the latents
+    roughness: float = 0.5  # of skin (FLARE: 0.5 ± 0.1), fixed
+    jitter: float = 0.03  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
+    embedding: float = 1e-4  # λ6, on ‖z‖²
+    smoothness: float = 0.05  # λ7 (NeRFactor)
+    specular_anchor: float = 0.02  # pull of the specular albedo towards that of skin, which images hardly determine
+    skin_specular: float = 0.375  # mean specular albedo of skin (FLARE)
+    white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
+
+
+@dataclass(frozen=True)
+class FrozenScene:
+    """What the AF-SM sees of a scene: the frozen deformation's outputs at its points, and its observations."""
+
+    x_ref: np.ndarray  # [3, P]
+    gamma: np.ndarray  # [N_γ, P]
+    normals: np.ndarray  # [3, P] unit, of the field
+    jittered_x_ref: np.ndarray  # [3, P] at x + ε
+    jittered_gamma: np.ndarray  # [N_γ, P]
+    scene: TrainingScene
+
+
+def freeze_scene(
+    architecture: AvatarArchitecture, shape: dict[str, np.ndarray], z_sdf: np.ndarray, scene: TrainingScene, jitter: float
+) -> FrozenScene:
+    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at a scene's points."""
+    networks = architecture.networks
+    field = SdfField(
+        layers(networks["deformation"], mi.Float(shape["deformation"]), mi.TensorXf(z_sdf[:, None])),
+        layers(networks["reference"], mi.Float(shape["reference"])),
+        architecture.sdf_octaves,
+    )
+    rng = np.random.default_rng(len(scene.points))
+    x = scene.points.T
+    moved = x + jitter * rng.standard_normal(x.shape).astype(np.float32)
+    _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
+    _, _, jittered_x_ref, jittered_gamma = evaluate_in_chunks(lambda p: surface(field, p), moved)
+    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+    return FrozenScene(x_ref, gamma, normals, jittered_x_ref, jittered_gamma, scene)
+
+
+def initial_appearance_model(architecture: AvatarArchitecture, scenes: int, seed: int) -> dict:
+    """Starting values of the three decoders and the latents [dim, scenes]."""
+    rng = np.random.default_rng([seed, 1])
+    networks = architecture.networks
+    return {
+        **{name: initial_parameters(networks[name], rng, output_scale=0.1) for name in NETWORKS},
+        **{
+            name: (rng.standard_normal((architecture.latents[name], scenes)) * 0.1).astype(np.float32)
+            for name in LATENTS
+        },
+    }
+
+
+@dataclass(frozen=True)
+class AppearanceBatch:
+    """Observations of some scenes, those of one scene consecutive; tensors."""
+
+    scenes: mi.TensorXf  # [total scenes, S] one-hot columns
+    count: int  # S
+    x_ref: mi.TensorXf  # [3, S·n]
+    gamma: mi.TensorXf
+    normals: mi.TensorXf
+    jittered_x_ref: mi.TensorXf
+    jittered_gamma: mi.TensorXf
+    views: mi.TensorXf  # [3, S·n] from the camera to the point
+    colors: mi.TensorXf  # [3, S·n]
+
+
+def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.random.Generator) -> AppearanceBatch:
+    """A random batch of observations."""
+    chosen = np.sort(rng.choice(len(scenes), min(settings.scenes, len(scenes)), replace=False))
+    names = ("x_ref", "gamma", "normals", "jittered_x_ref", "jittered_gamma")
+    parts: dict[str, list] = {name: [] for name in (*names, "views", "colors")}
+    for k in chosen:
+        frozen = scenes[k]
+        samples = rng.integers(len(frozen.scene.sample_point), size=settings.points)
+        points = frozen.scene.sample_point[samples]
+        for name in names:
+            parts[name].append(getattr(frozen, name)[:, points])
+        parts["views"].append(frozen.scene.views(samples).T)
+        parts["colors"].append(frozen.scene.sample_color[samples].T)
+    one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
+    one_hot[chosen, np.arange(len(chosen))] = 1
+    tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v, axis=1))) for k, v in parts.items()}
+    return AppearanceBatch(mi.TensorXf(one_hot), len(chosen), **tensor)
+
+
+def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes):
+    """Eq. 8 in closed form: diffuse and specular radiance [3, N] of surface points under `lobes` [N_l, 7].
+
+    `albedo` [3, N], `specular` [1, N], roughness and k_s numbers or [1, 1], unit `normals` [3, N], `views` [3, N] from the camera to the point. Normals that
+    face away from the camera are bent to grazing."""
+    irradiance, specular_radiance = shade(
+        from_columns(normals, mi.Vector3f),
+        from_columns(-views, mi.Vector3f),
+        from_columns(specular, mi.Float),
+        mi.Float(roughness),
+        lobes,
+    )
+    return albedo * to_columns(irradiance) * (1 / np.pi), to_columns(specular_radiance) * k_s
+
+
+def appearance_losses(architecture, settings: AppearanceTraining, parameters: dict, batch: AppearanceBatch) -> dict:
+    """Every term of eq. 10 and the two anchors, unweighted, by the names of `AppearanceTraining`."""
+    z_a, z_s, z_l = (parameters[name] @ batch.scenes for name in LATENTS)
+    networks = architecture.networks
+    diffuse = layers(networks["diffuse_albedo"], parameters["diffuse_albedo"], z_a)
+    speculars = layers(networks["specular_albedo"], parameters["specular_albedo"], z_s)
+    albedo = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.x_ref, batch.gamma)
+    moved = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.jittered_x_ref, batch.jittered_gamma)
+    specular = specular_albedo(speculars, architecture.specular_octaves, batch.x_ref)
+    lobes = illumination(layers(networks["illumination"], parameters["illumination"]), z_l)
+
+    n = batch.x_ref.shape[1] // batch.count
+    radiance = []
+    for k in range(batch.count):
+        mine = slice(k * n, (k + 1) * n)
+        parts = physical_radiance(
+            albedo[:, mine],
+            specular[:, mine],
+            batch.normals[:, mine],
+            batch.views[:, mine],
+            settings.roughness,
+            1.0,
+            lobes[:, :, k],
+        )
+        radiance.append(parts[0] + parts[1])
+    difference = albedo - moved
+    anchor = specular - settings.skin_specular
+    grey = dr.log(lobes[:, 4:7, :]) - dr.mean(dr.log(lobes[:, 4:7, :]), axis=1, mode=None)[:, None, :]
+    return {
+        "color": losses.photometric_loss(dr.concat(radiance, axis=1), batch.colors),
+        "embedding": losses.embedding_loss(z_a) + losses.embedding_loss(z_s) + losses.embedding_loss(z_l),
+        "smoothness": losses.mean(dr.abs(difference)),
+        "specular_anchor": losses.mean(anchor * anchor),
+        "white_light": losses.mean(grey * grey),
+    }
+
+
+def weighted_sum(terms: dict, settings: AppearanceTraining):
+    """L_Col + Σ λ L."""
+    return sum((getattr(settings, k) * v for k, v in terms.items() if k != "color"), terms["color"])
+
+
+def rates(settings: AppearanceTraining, step: int) -> dict[str, float]:
+    """Learning rate of every parameter at `step`."""
+    fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
+    return {**dict.fromkeys(NETWORKS, settings.learning_rate * fall), **dict.fromkeys(LATENTS, settings.latent_rate * fall)}
+
+
+def training_step(architecture, settings: AppearanceTraining, optimizer, batch: AppearanceBatch) -> dict[str, float]:
+    """One Adam step; returns the unweighted terms."""
+    dr.enable_grad(*(optimizer[name] for name in optimizer))
+    terms = appearance_losses(architecture, settings, dict(optimizer.items()), batch)
+    dr.backward(weighted_sum(terms, settings))
+    optimizer.step()
+    return {name: float(value.numpy().item()) for name, value in terms.items()}

@@ -1,0 +1,192 @@
+"""The avatar: all networks, latents and lights of one head, as one safetensors file.
+
+A prior is the same thing with zero latents, its mean head, so that every plugin opens either. Networks are flat
+parameter vectors (`sira_mi.fields.mlp`). The file's metadata holds the format's name and the architecture as JSON;
+every size is checked against the architecture before any array is used.
+"""
+
+import dataclasses
+import json
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from sira_mi.errors import InputError
+from sira_mi.fields.encoding import encoded_size
+from sira_mi.fields.mlp import Architecture
+
+FORMAT = "sira-mi avatar 1"
+LANDMARKS = 468
+PRIOR = Path(__file__).with_name("prior.safetensors")
+_MAXIMUM_BYTES = 64 << 20
+_MAXIMUM_LOBES = 4096
+
+
+@dataclass(frozen=True)
+class AvatarArchitecture:
+    """Sizes of all decoders; octaves belong to the positional encoding of each network's point."""
+
+    features: int = 16  # N_γ, length of the auxiliary feature vector γ
+    sdf_octaves: int = 6
+    sdf_width: int = 96
+    sdf_depth: int = 4
+    sdf_latent: int = 64  # dimension of z_sdf
+    rendering_octaves: int = 5
+    rendering_width: int = 96
+    rendering_depth: int = 3
+    rendering_latent: int = 64  # dimension of z_r
+    albedo_octaves: int = 6
+    albedo_width: int = 64
+    albedo_depth: int = 3
+    albedo_latent: int = 32  # dimension of z_a
+    specular_octaves: int = 4
+    specular_width: int = 32
+    specular_depth: int = 2
+    specular_latent: int = 8  # dimension of z_s
+    refinement_octaves: int = 9
+    refinement_width: int = 96
+    refinement_depth: int = 3
+    lobes: int = 48  # N_l, number of spherical Gaussians of the illumination decoder
+    illumination_width: int = 64
+    illumination_depth: int = 2
+    illumination_latent: int = 24  # dimension of z_l
+
+    def __post_init__(self):
+        if any(not isinstance(v, int) or not 0 < v <= 4096 for v in dataclasses.asdict(self).values()):
+            raise ValueError("every size of an avatar is a whole number from 1 to 4096")
+
+    @cached_property
+    def networks(self) -> dict[str, Architecture]:
+        """The architecture of every network, by the name of its tensor."""
+        gamma = self.features
+        sdf = encoded_size(self.sdf_octaves)
+        albedo = encoded_size(self.albedo_octaves) + gamma
+        width, depth = self.sdf_width, self.sdf_depth
+        return {
+            "deformation": Architecture(sdf, 3 + gamma, width, depth, self.sdf_latent),
+            "reference": Architecture(sdf, 1, width, depth),
+            "rendering": Architecture(
+                encoded_size(self.rendering_octaves) + 6 + gamma,
+                3,
+                self.rendering_width,
+                self.rendering_depth,
+                self.rendering_latent,
+            ),
+            "diffuse_albedo": Architecture(albedo, 3, self.albedo_width, self.albedo_depth, self.albedo_latent),
+            "specular_albedo": Architecture(
+                encoded_size(self.specular_octaves),
+                1,
+                self.specular_width,
+                self.specular_depth,
+                self.specular_latent,
+            ),
+            "albedo_refinement": Architecture(
+                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
+            ),
+            "illumination": Architecture(
+                self.illumination_latent, 7 * self.lobes, self.illumination_width, self.illumination_depth
+            ),
+        }
+
+    @cached_property
+    def latents(self) -> dict[str, int]:
+        """Dimension of every latent, by the name of its tensor."""
+        return {
+            "z_sdf": self.sdf_latent,
+            "z_r": self.rendering_latent,
+            "z_a": self.albedo_latent,
+            "z_s": self.specular_latent,
+            "z_l": self.illumination_latent,
+        }
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
+    architecture; `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light; `landmarks` [468, 3], the face
+    landmarks of the mean head in scene units (NaN where unknown)."""
+
+    architecture: AvatarArchitecture
+    tensors: dict[str, np.ndarray]
+    roughness: float = 0.5  # of the specular BRDF, fixed
+    k_s: float = 1.0  # weight of the specular BRDF, eq. 8
+    k_r: float = 1.0  # weight of the albedo refinement, eq. 11
+
+    def replaced(self, **tensors: np.ndarray) -> "Avatar":
+        """The same avatar with some tensors replaced."""
+        return dataclasses.replace(self, tensors={**self.tensors, **tensors})
+
+
+def save_avatar(path: str | Path, avatar: Avatar) -> None:
+    """Writes a safetensors file under a temporary name, then renames it.
+
+    Raises InputError when the file cannot be written."""
+    description = {
+        "architecture": dataclasses.asdict(avatar.architecture),
+        "roughness": avatar.roughness,
+        "k_s": avatar.k_s,
+        "k_r": avatar.k_r,
+    }
+    tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
+    data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"cannot write the avatar {path}: {error.strerror or error}") from error
+
+
+def load_avatar(path: str | Path | None = None) -> Avatar:
+    """Reads an avatar or prior file; without a path, the prior shipped with the package.
+
+    Raises InputError for a file that is missing, damaged, of another kind, or holds values that are not finite."""
+    path = Path(path) if path else PRIOR
+    try:
+        if path.stat().st_size > _MAXIMUM_BYTES:
+            raise InputError(f"{path} is larger than any avatar; give an avatar.safetensors written by sira_mi")
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise InputError(f"{path} is not an avatar of this version ({FORMAT}); fit the photo again")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+    except OSError as error:
+        raise InputError(f"cannot read the avatar {path}: {error.strerror or error}") from error
+    except SafetensorError as error:
+        raise InputError(f"{path} is damaged or not a safetensors file: {error}") from error
+    try:
+        description = json.loads(metadata["avatar"])
+        architecture = AvatarArchitecture(**description["architecture"])
+        scalars = {name: float(description[name]) for name in ("roughness", "k_s", "k_r")}
+        avatar = Avatar(architecture, tensors, **scalars)
+        _check(avatar)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged: {error}") from error
+    return avatar
+
+
+def _check(avatar: Avatar) -> None:
+    """Raises ValueError unless every tensor is there, of its due size and type, and finite."""
+    architecture, tensors = avatar.architecture, avatar.tensors
+    due = {name: (network.parameters,) for name, network in architecture.networks.items()}
+    due |= {name: (size,) for name, size in architecture.latents.items()}
+    due |= {"lobes": (tensors["lobes"].shape[0], 7), "landmarks": (LANDMARKS, 3)}
+    if not 0 < due["lobes"][0] <= _MAXIMUM_LOBES:
+        raise ValueError(f"between 1 and {_MAXIMUM_LOBES} lobes expected")
+    for name, shape in due.items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != np.float32:
+            raise ValueError(f"tensor {name} is {tensor.dtype}{list(tensor.shape)}, float32{list(shape)} expected")
+        if name != "landmarks" and not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name} has values that are not finite")
+    if extra := set(tensors) - set(due):
+        raise ValueError(f"unknown tensors {sorted(extra)}")
+    if not (0.01 <= avatar.roughness <= 1 and 0 <= avatar.k_s <= 1 and 0 <= avatar.k_r <= 1):
+        raise ValueError("roughness lies in [0.01, 1], k_s and k_r in [0, 1]")

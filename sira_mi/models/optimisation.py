@@ -1,0 +1,79 @@
+"""Adam with checkpoints: Dr.Jit's optimizer, its state as NumPy arrays, and files that hold it."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from sira_mi.errors import InputError
+
+
+def adam(parameters: Mapping[str, np.ndarray], learning_rates: Mapping[str, float], beta_2: float = 0.99):
+    """A `mi.ad.Adam` over `parameters` (float32 arrays; one-dimensional ones become Floats, others tensors), each with
+    its own learning rate."""
+    optimizer = mi.ad.Adam(lr=1e-3, beta_2=beta_2)
+    for name, value in parameters.items():
+        optimizer[name] = to_array(value)
+        optimizer.set_learning_rate({name: learning_rates[name]})
+    return optimizer
+
+
+def to_array(value: np.ndarray):
+    """A Float for a one-dimensional array, else a tensor."""
+    value = np.ascontiguousarray(value, dtype=np.float32)
+    return mi.Float(value) if value.ndim == 1 else mi.TensorXf(value)
+
+
+def parameter_values(optimizer) -> dict[str, np.ndarray]:
+    """The current parameters as NumPy arrays."""
+    return {name: dr.detach(value).numpy() for name, value in optimizer.items()}
+
+
+def optimizer_state(optimizer) -> dict[str, np.ndarray]:
+    """Everything a later `restore_optimizer` needs: values, step counts and both moments of every parameter."""
+    state = {}
+    for name, (value, _, _, (count, first, second, *_)) in optimizer.state.items():
+        state[f"{name}/value"] = dr.detach(value).numpy()
+        state[f"{name}/count"] = np.array([count], np.float32)
+        state[f"{name}/first"] = np.zeros_like(state[f"{name}/value"]) if count == 0 else first.numpy()
+        state[f"{name}/second"] = np.zeros_like(state[f"{name}/value"]) if count == 0 else second.numpy()
+    return state
+
+
+def restore_optimizer(optimizer, state: Mapping[str, np.ndarray]) -> None:
+    """Sets the optimizer to a state of `optimizer_state`; its parameters must be those of the state.
+
+    Raises KeyError or ValueError when they are not."""
+    for name, (value, promoted, rate, (_, _, _, *rest)) in list(optimizer.state.items()):
+        if state[f"{name}/value"].shape != dr.shape(value):
+            raise ValueError(f"parameter {name} has another size")
+        optimizer[name] = to_array(state[f"{name}/value"])
+        value = optimizer.state[name][0]
+        moments = to_array(state[f"{name}/first"]), to_array(state[f"{name}/second"])
+        optimizer.state[name] = (value, promoted, rate, (int(state[f"{name}/count"][0]), *moments, *rest))
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Writes a safetensors file under a temporary name, then renames it. Raises InputError when that fails."""
+    arrays = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in arrays.items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(save(arrays, metadata=dict(metadata)))
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The arrays and metadata of a file by `write_arrays`. Raises InputError when it cannot be read."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"cannot read the checkpoint {path}: {error}; remove it to start again") from error

@@ -1,0 +1,54 @@
+"""The prior: a trained SA-SM and AF-SM as one avatar with mean latents, its mean head."""
+
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fields.appearance import illumination
+from sira_mi.fields.mlp import initial_parameters, layers
+from sira_mi.models.avatar import Avatar, AvatarArchitecture
+
+NETWORKS_OF_SHAPE = ("deformation", "reference", "rendering")
+NETWORKS_OF_APPEARANCE = ("diffuse_albedo", "specular_albedo", "illumination")
+
+
+def centred(architecture, name: str, network: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Network parameters whose zero latent is what the latent `mean` was: Z mean is added to every bias."""
+    flat, offset = network.copy(), 0
+    for weight, bias, latent in architecture.networks[name].shapes():
+        start_bias = offset + weight[0] * weight[1]
+        start_latent = start_bias + bias[0]
+        offset = start_latent + latent[0] * latent[1]
+        if latent[1]:
+            flat[start_bias:start_latent] += flat[start_latent:offset].reshape(latent) @ mean
+    return flat
+
+
+def assemble_prior(
+    architecture: AvatarArchitecture,
+    shape: dict[str, np.ndarray],
+    appearance: dict[str, np.ndarray],
+    landmarks: np.ndarray,
+    roughness: float,
+    seed: int,
+) -> Avatar:
+    """The mean head of both trained models: latents [dim, scenes] are centred on their mean, the light is the mean
+    light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
+    that have them."""
+    owners = {"z_sdf": "deformation", "z_r": "rendering", "z_a": "diffuse_albedo", "z_s": "specular_albedo"}
+    tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {name: appearance[name] for name in NETWORKS_OF_APPEARANCE}
+    latents = {**shape, **appearance}
+    for name, network in owners.items():
+        tensors[network] = centred(architecture, network, tensors[network], latents[name].mean(axis=1))
+    for name, size in architecture.latents.items():
+        tensors[name] = np.zeros(size, np.float32)
+    tensors["z_l"] = latents["z_l"].mean(axis=1)
+    rng = np.random.default_rng([seed, 4])
+    refinement = architecture.networks["albedo_refinement"]
+    tensors["albedo_refinement"] = initial_parameters(refinement, rng, output_scale=0.0)
+    network = layers(architecture.networks["illumination"], mi.Float(tensors["illumination"]))
+    tensors["lobes"] = illumination(network, mi.TensorXf(tensors["z_l"][:, None])).numpy()[:, :, 0]
+    with np.errstate(invalid="ignore"):
+        counts = np.isfinite(landmarks[:, :, :1]).sum(axis=0)
+        mean = np.nansum(landmarks, axis=0) / np.maximum(counts, 1)
+    tensors["landmarks"] = np.where(counts > 0, mean, np.nan).astype(np.float32)
+    return Avatar(architecture, {k: v.astype(np.float32) for k, v in tensors.items()}, roughness=roughness, k_r=0.0)

@@ -1,0 +1,149 @@
+"""SA-SM, the shape and appearance model: auto-decoder training with the losses of eq. 7 (section 3.1.2)."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fields.appearance import rendered_radiance
+from sira_mi.fields.mlp import initial_parameters, layers
+from sira_mi.fields.sdf import SdfField, deform, normalised, sphere_parameters, surface
+from sira_mi.models import losses
+from sira_mi.models.avatar import AvatarArchitecture
+from sira_mi.models.scenes import TrainingScene
+
+NETWORKS = ("deformation", "reference", "rendering")
+LATENTS = ("z_sdf", "z_r")
+
+
+@dataclass(frozen=True)
+class ShapeTraining:
+    """Settings of the SA-SM training; λ as in eq. 7."""
+
+    steps: int = 6000
+    scenes: int = 8  # scenes a step
+    surface_points: int = 512  # a scene and step
+    volume_points: int = 192  # a scene and step
+    landmarks: int = 64  # a scene and step
+    learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
+    latent_rate: float = 4e-3  # of the latents
+    initial_radius: float = 1.4  # of the reference sphere, scene units
+    surface: float = 2.0  # L_Surf (NPHM)
+    normal: float = 0.3  # normals of the scans (IGR, NPHM)
+    distance: float = 0.15  # signed distance of the volume points; takes the place of a free-space term
+    eikonal: float = 0.05  # λ1 (NPHM 0.1)
+    deformation: float = 2e-3  # λ2 (i3DMM 1e-4, there on other units)
+    landmark: float = 0.5  # λ3 (i3DMM 1.0)
+    color: float = 0.25  # λ4 (i3DMM)
+    embedding: float = 1e-4  # λ5 (i3DMM), on ‖z‖²
+
+
+def initial_shape_model(architecture: AvatarArchitecture, settings: ShapeTraining, scenes: int, seed: int) -> dict:
+    """Starting values of all networks and latents [dim, scenes]: the reference a sphere, the deformation almost zero."""
+    rng = np.random.default_rng([seed, 0])
+    networks = architecture.networks
+    return {
+        "deformation": initial_parameters(networks["deformation"], rng, output_scale=0.02),
+        "reference": sphere_parameters(networks["reference"], rng, settings.initial_radius),
+        "rendering": initial_parameters(networks["rendering"], rng, output_scale=0.3),
+        **{
+            name: (rng.standard_normal((architecture.latents[name], scenes)) * 0.1 / np.sqrt(10)).astype(np.float32)
+            for name in LATENTS
+        },
+    }
+
+
+@dataclass(frozen=True)
+class ShapeBatch:
+    """Points of some scenes, the points of one scene consecutive; tensors."""
+
+    scenes: mi.TensorXf  # [total scenes, S] one-hot columns that pick the scenes' latents
+    count: int  # S
+    points: mi.TensorXf  # [3, S·n]
+    normals: mi.TensorXf  # [3, S·n]
+    views: mi.TensorXf  # [3, S·n]
+    colors: mi.TensorXf  # [3, S·n]
+    volume: mi.TensorXf  # [3, S·q]
+    volume_distance: mi.TensorXf  # [1, S·q]
+    landmarks: mi.TensorXf  # [3, S·l]
+
+
+def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.random.Generator) -> ShapeBatch:
+    """A random batch; landmarks that are unknown in any of the drawn scenes are left out of the draw."""
+    chosen = np.sort(rng.choice(len(scenes), min(settings.scenes, len(scenes)), replace=False))
+    parts: dict[str, list] = {k: [] for k in ("points", "normals", "views", "colors", "volume", "distance", "landmarks")}
+    known = np.all([np.isfinite(scenes[k].landmarks).all(axis=1) for k in chosen], axis=0)
+    landmarks = rng.choice(np.flatnonzero(known), settings.landmarks)
+    for k in chosen:
+        scene = scenes[k]
+        samples = rng.integers(len(scene.sample_point), size=settings.surface_points)
+        points = scene.sample_point[samples]
+        volume = rng.integers(len(scene.volume), size=settings.volume_points)
+        parts["points"].append(scene.points[points])
+        parts["normals"].append(scene.normals[points])
+        parts["views"].append(scene.views(samples))
+        parts["colors"].append(scene.sample_color[samples])
+        parts["volume"].append(scene.volume[volume])
+        parts["distance"].append(scene.volume_distance[volume][:, None])
+        parts["landmarks"].append(scene.landmarks[landmarks])
+    one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
+    one_hot[chosen, np.arange(len(chosen))] = 1
+    tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v).T, dtype=np.float32)) for k, v in parts.items()}
+    return ShapeBatch(
+        mi.TensorXf(one_hot),
+        len(chosen),
+        tensor["points"],
+        tensor["normals"],
+        tensor["views"],
+        tensor["colors"],
+        tensor["volume"],
+        tensor["distance"],
+        tensor["landmarks"],
+    )
+
+
+def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: ShapeBatch) -> dict:
+    """Every term of eq. 7 and the two on scan normals and distances, unweighted, by the names of `ShapeTraining`."""
+    z_sdf, z_r = (parameters[name] @ batch.scenes for name in LATENTS)
+    networks = architecture.networks
+    field = SdfField(
+        layers(networks["deformation"], parameters["deformation"], z_sdf),
+        layers(networks["reference"], parameters["reference"]),
+        architecture.sdf_octaves,
+    )
+    f, gradient, x_ref, gamma = surface(field, batch.points)
+    f_volume, gradient_volume, _, _ = surface(field, batch.volume)
+    rendering = layers(networks["rendering"], parameters["rendering"], z_r)
+    octaves = architecture.rendering_octaves
+    radiance = rendered_radiance(rendering, octaves, x_ref, normalised(gradient), batch.views, gamma)
+    return {
+        "surface": losses.surface_loss(f),
+        "normal": losses.normal_loss(gradient, batch.normals),
+        "distance": losses.distance_loss(f_volume, batch.volume_distance),
+        "eikonal": losses.eikonal_loss(gradient_volume),
+        "deformation": losses.deformation_loss(x_ref - batch.points, batch.count),
+        "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
+        "color": losses.photometric_loss(radiance, batch.colors),
+        "embedding": losses.embedding_loss(z_sdf) + losses.embedding_loss(z_r),
+    }
+
+
+def weighted_sum(terms: dict, settings: ShapeTraining):
+    """Σ λ L over the terms."""
+    return sum((getattr(settings, name) * value for name, value in terms.items()), mi.TensorXf([0.0]))
+
+
+def rates(settings: ShapeTraining, step: int) -> dict[str, float]:
+    """Learning rate of every parameter at `step`."""
+    fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
+    return {**dict.fromkeys(NETWORKS, settings.learning_rate * fall), **dict.fromkeys(LATENTS, settings.latent_rate * fall)}
+
+
+def training_step(architecture, settings: ShapeTraining, optimizer, batch: ShapeBatch) -> dict[str, float]:
+    """One Adam step; returns the unweighted terms."""
+    dr.enable_grad(*(optimizer[name] for name in optimizer))
+    terms = shape_losses(architecture, dict(optimizer.items()), batch)
+    dr.backward(weighted_sum(terms, settings))
+    optimizer.step()
+    return {name: float(value.numpy().item()) for name, value in terms.items()}

@@ -1,0 +1,139 @@
+"""Files of lights: `lights.json` with lobes, and latitude-longitude OpenEXR images in Mitsuba's convention.
+
+    {"lobes": [{"axis": [x, y, z], "sharpness": λ, "amplitude": [r, g, b]}, ...]}
+"""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from sira_mi.errors import InputError
+
+MAXIMUM_LOBES = 4096
+# Width and height of an environment image that is still read.
+_MAXIMUM_SIDE = 32768
+_MAXIMUM_JSON_BYTES = 4 << 20
+
+
+def check_lobes(lobes: np.ndarray, source: str) -> np.ndarray:
+    """`lobes` `[N_l, 7]` as float32 with unit axes; InputError names `source` and the first bad entry."""
+    lobes = np.asarray(lobes)
+    if lobes.ndim != 2 or lobes.shape[1] != 7:
+        raise InputError(f"{source}: lobes must have the shape [N_l, 7], not {list(lobes.shape)}")
+    if not 1 <= len(lobes) <= MAXIMUM_LOBES:
+        raise InputError(f"{source}: {len(lobes)} lobes; there must be 1 to {MAXIMUM_LOBES}")
+    lobes = lobes.astype(np.float64)
+    single = lobes.astype(np.float32)
+    length = np.linalg.norm(lobes[:, :3], axis=1)
+    for fault, bad in (
+        ("a value that is not finite", ~np.isfinite(single).all(axis=1)),
+        ("an axis of zero length", ~(length > 1e-20)),
+        ("a sharpness that is not positive", ~(single[:, 3] > 0.0)),
+        ("a negative amplitude", (lobes[:, 4:] < 0.0).any(axis=1)),
+    ):
+        if bad.any():
+            raise InputError(f"{source}: lobe {int(np.argmax(bad))} has {fault}")
+    lobes[:, :3] /= length[:, None]
+    return lobes.astype(np.float32)
+
+
+def _numbers(entry, key, count, source):
+    value = entry.get(key)
+    values = value if count > 1 else [value]
+    if not isinstance(values, list) or len(values) != count:
+        raise InputError(f'{source}: "{key}" must be {"a number" if count == 1 else f"{count} numbers"}')
+    if any(isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x) for x in values):
+        raise InputError(f'{source}: "{key}" must hold finite numbers')
+    return [float(x) for x in values]
+
+
+def read_lights(path: str | Path) -> np.ndarray:
+    """Lobes `[N_l, 7]` (float32, unit axes) of a `lights.json`; InputError for anything else."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAXIMUM_JSON_BYTES:
+            raise InputError(f"{path}: larger than a file of {MAXIMUM_LOBES} lobes can be")
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a JSON file ({error})") from error
+    entries = document.get("lobes") if isinstance(document, dict) else None
+    if not isinstance(entries, list):
+        raise InputError(f'{path}: there must be a list "lobes"')
+    if not 1 <= len(entries) <= MAXIMUM_LOBES:
+        raise InputError(f"{path}: {len(entries)} lobes; there must be 1 to {MAXIMUM_LOBES}")
+    rows = []
+    for index, entry in enumerate(entries):
+        source = f"{path}: lobe {index}"
+        if not isinstance(entry, dict):
+            raise InputError(f'{source} must be an object with "axis", "sharpness" and "amplitude"')
+        rows.append(sum((_numbers(entry, k, n, source) for k, n in _FIELDS), []))
+    return check_lobes(np.array(rows), str(path))
+
+
+_FIELDS = (("axis", 3), ("sharpness", 1), ("amplitude", 3))
+
+
+def _replace(path: Path, write) -> None:
+    """Calls `write(temporary)` and renames; nothing half-written stays behind."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_lights(path: str | Path, lobes: np.ndarray) -> None:
+    """Writes a `lights.json` of lobes `[N_l, 7]` atomically; reading it back gives the same float32 values."""
+    rows = check_lobes(lobes, str(path)).tolist()
+    entries = [{"axis": row[:3], "sharpness": row[3], "amplitude": row[4:]} for row in rows]
+    text = ",\n  ".join(json.dumps(entry) for entry in entries)
+    _replace(Path(path), lambda file: file.write_text(f'{{"lobes": [\n  {text}\n]}}\n', encoding="utf-8"))
+
+
+def read_environment(path: str | Path) -> np.ndarray:
+    """Radiance `[H, W, 3]` (float32) of a latitude-longitude OpenEXR; InputError unless it is finite and about 2:1."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:
+        raise InputError(f"{path}: not a readable OpenEXR image") from error
+    names = ("R", "G", "B") if {"R", "G", "B"} <= channels.keys() else ("Y", "Y", "Y")
+    if names[0] not in channels:
+        raise InputError(f"{path}: no channels R, G, B or Y")
+    planes = [np.asarray(channels[name]) for name in names]
+    height, width = planes[0].shape
+    if any(plane.shape != (height, width) for plane in planes) or max(height, width) > _MAXIMUM_SIDE:
+        raise InputError(f"{path}: subsampled channels or an unreasonable size of {width} × {height}")
+    if height < 2 or not 1.8 <= width / height <= 2.2:
+        raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
+    image = np.stack(planes, axis=-1).astype(np.float32)
+    if not np.isfinite(image).all():
+        raise InputError(f"{path}: holds values that are not finite")
+    return np.maximum(image, 0.0)
+
+
+def write_environment(path: str | Path, image: np.ndarray) -> None:
+    """Writes radiance `[H, W, 3]` as a 32-bit OpenEXR, atomically."""
+    image = np.ascontiguousarray(image, np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+    def write(file):
+        try:
+            with OpenEXR.File(header, {"RGB": image}) as output:
+                output.write(str(file))
+        except RuntimeError as error:
+            raise OSError(f"OpenEXR: {error}") from error
+
+    _replace(Path(path), write)

@@ -1,0 +1,222 @@
+"""Closed-form eq. 8: what a surface point reflects of an environment of spherical Gaussians, without shadows.
+
+Diffuse radiance is albedo/π times the irradiance; specular radiance is the integral of light × f^s × (n·ω)₊ with f^s of
+`brdf.py`, by the lobes of `specular.py`. `specular_lobe` and `specular_radiance_physg` are PhySG's warped distribution
+and its closed form with one hemisphere integral instead of a two-term cosine: the baseline that `specular.py` improves.
+"""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from sira_mi.sg import brdf
+from sira_mi.sg.integrals import cosine_integral, hemisphere_integral, product
+from sira_mi.sg.lobes import lobe_count, unpack_lobe, unpack_raw
+from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
+
+# A view direction lower than this cosine is shaded as if at it: PhySG's warped sharpness is λ/(4 n·v).
+_MINIMUM_VIEW_COSINE = 1e-3
+# Points that one lane adds up in the adjoint of the lobes; fixed, so that the order of the sum is.
+_POINTS_PER_LANE = 32
+
+
+def diffuse_irradiance(
+    normal: "mi.Vector3f", axis: "mi.Vector3f", sharpness: "mi.Float", amplitude: "mi.Color3f"
+) -> "mi.Color3f":
+    """∫ G (ω·n)₊ dω of one light lobe: irradiance `[..., 3]`; times albedo/π it is diffuse radiance."""
+    return amplitude * cosine_integral(dr.dot(normal, axis), sharpness)
+
+
+def specular_lobe(
+    normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float"
+) -> tuple["mi.Vector3f", "mi.Float", "mi.Float"]:
+    """PhySG's warped distribution as a lobe of light directions: mirror axis, sharpness λ/(4 n·v), amplitude 1/(πr⁴)."""
+    cosine = dr.maximum(dr.dot(normal, view), _MINIMUM_VIEW_COSINE)
+    sharpness = brdf.distribution_sharpness(roughness)
+    mirror = dr.normalize(2.0 * cosine * normal - view)
+    return mirror, sharpness / (4.0 * cosine), sharpness * (0.5 / math.pi)
+
+
+def specular_radiance(
+    normal: "mi.Vector3f",
+    view: "mi.Vector3f",
+    specular_albedo: "mi.Float",
+    roughness: "mi.Float",
+    axis: "mi.Vector3f",
+    sharpness: "mi.Float",
+    amplitude: "mi.Color3f",
+) -> "mi.Color3f":
+    """∫ G f^s (ω·n)₊ dω of one light lobe `[..., 3]`, 0 where the view is below the surface."""
+    white, grazing = specular_integrals(specular_lobes(normal, view, roughness), axis, sharpness)
+    return amplitude * dr.lerp(grazing, white, specular_albedo)
+
+
+def specular_radiance_physg(
+    normal: "mi.Vector3f",
+    view: "mi.Vector3f",
+    specular_albedo: "mi.Float",
+    roughness: "mi.Float",
+    axis: "mi.Vector3f",
+    sharpness: "mi.Float",
+    amplitude: "mi.Color3f",
+) -> "mi.Color3f":
+    """`specular_radiance` as in PhySG: one warped lobe, Fresnel and masking at the mirror direction."""
+    cosine = dr.dot(normal, view)
+    lobe_axis, lobe_sharpness, lobe_amplitude = specular_lobe(normal, view, roughness)
+    joint_axis, joint_sharpness, log_amplitude = product(lobe_axis, lobe_sharpness, axis, sharpness)
+    integral = dr.exp(log_amplitude) * hemisphere_integral(dr.dot(normal, joint_axis), joint_sharpness)
+    cos_mirror = dr.maximum(cosine, _MINIMUM_VIEW_COSINE)
+    moment = dr.square(brdf.visibility(cos_mirror, roughness)) * brdf.fresnel(specular_albedo, cos_mirror)
+    return amplitude * dr.select(cosine > 0.0, 0.25 * lobe_amplitude * moment * integral, 0.0)
+
+
+def _integrate_lobe(point, axis, sharpness, amplitude):
+    """Irradiance, white and grazing specular radiance `[..., 3]` of one light lobe."""
+    white, grazing = specular_integrals(point, axis, sharpness)
+    return diffuse_irradiance(point.normal, axis, sharpness, amplitude), amplitude * white, amplitude * grazing
+
+
+def _weigh(parts, gradient):
+    """Σ parts · gradient, the scalar whose derivative is the adjoint."""
+    return sum(dr.dot(part, weight) for part, weight in zip(parts, gradient, strict=True))
+
+
+def _sum_over_lobes(point, packed, count):
+    """Irradiance, white and grazing specular radiance under all lobes, by a symbolic loop in each lane.
+
+    `max_iterations` lets Dr.Jit differentiate the loop in reverse mode."""
+
+    def body(index, *sums):
+        parts = _integrate_lobe(point, *unpack_lobe(packed, index))
+        return index + 1, *(total + part for total, part in zip(sums, parts, strict=True))
+
+    return dr.while_loop(
+        state=(mi.UInt32(0), mi.Color3f(0.0), mi.Color3f(0.0), mi.Color3f(0.0)),
+        cond=lambda index, *_: index < count,
+        body=body,
+        labels=("index", "irradiance", "white", "grazing"),
+        max_iterations=count,
+    )[1:]
+
+
+def _point_gradient(point, packed, count, gradient):
+    """Adjoint of `_sum_over_lobes` in `point`: a loop over the lobes in each lane."""
+
+    def body(index, *sums):
+        inputs = tuple(type(value)(value) for value in point)
+        dr.enable_grad(inputs)
+        parts = _integrate_lobe(SpecularLobes(*inputs), *unpack_lobe(packed, index))
+        dr.backward(_weigh(parts, gradient))
+        return index + 1, *(total + dr.grad(value) for total, value in zip(sums, inputs, strict=True))
+
+    return dr.while_loop(
+        state=(mi.UInt32(0), *(type(value)(0.0) for value in point)),
+        cond=lambda index, *_: index < count,
+        body=body,
+        labels=("index", *(f"d_{name}" for name in point._fields)),
+    )[1:]
+
+
+def _lobe_gradient(point, packed, count, gradient):
+    """Adjoint of `_sum_over_lobes` in the flat lobe array, the same bits on every run.
+
+    Lane (lobe, chunk) loops over every `chunks`-th point, and the chunks are then added by a block reduction: each sum
+    has one fixed order, unlike a scatter-add from several threads."""
+    points = dr.width(*point, *gradient)
+    chunks = -(-points // _POINTS_PER_LANE)
+    lane = dr.arange(mi.UInt32, count * chunks)
+    lobe, chunk = lane // chunks, lane % chunks
+    point = tuple(value + dr.zeros(type(value), points) for value in point)
+    gradient = tuple(value + dr.zeros(type(value), points) for value in gradient)
+    dr.eval(point, gradient)
+
+    def body(step, *sums):
+        index = step * chunks + chunk
+        active = index < points
+        here = SpecularLobes(*(dr.gather(type(value), value, index, active) for value in point))
+        weights = [dr.gather(mi.Color3f, value, index, active) for value in gradient]
+        axis, sharpness, amplitude = inputs = unpack_raw(packed, lobe)
+        dr.enable_grad(inputs)
+        parts = _integrate_lobe(here, dr.normalize(axis), sharpness, amplitude)
+        dr.backward(dr.select(active, _weigh(parts, weights), 0.0))
+        return step + 1, *(total + dr.grad(value) for total, value in zip(sums, inputs, strict=True))
+
+    _, axis, sharpness, amplitude = dr.while_loop(
+        state=(dr.zeros(mi.UInt32, count * chunks), mi.Vector3f(0.0), mi.Float(0.0), mi.Color3f(0.0)),
+        cond=lambda step, *_: step < _POINTS_PER_LANE,
+        body=body,
+        labels=("step", "d_axis", "d_sharpness", "d_amplitude"),
+    )
+    return dr.ravel(mi.ArrayXf([dr.block_sum(value, chunks) for value in (*axis, sharpness, *amplitude)]))
+
+
+class _SumOverLobes(dr.CustomOp):
+    """`_sum_over_lobes` with adjoints whose sums have a fixed order."""
+
+    def eval(self, packed, count, *point):
+        self.inputs = SpecularLobes(*point), packed, count
+        return _sum_over_lobes(*self.inputs)
+
+    def forward(self):
+        point, packed, count = self.inputs
+        inputs = type(packed)(packed), *(type(value)(value) for value in point)
+        tangents = [self.grad_in("packed"), *self.grad_in("point")]
+        with dr.resume_grad():
+            dr.enable_grad(inputs)
+            for value, tangent in zip(inputs, tangents, strict=True):
+                dr.set_grad(value, tangent)
+            result = _sum_over_lobes(SpecularLobes(*inputs[1:]), inputs[0], count)
+            self.set_grad_out(dr.forward_to(result))
+
+    def backward(self):
+        gradient = self.grad_out()
+        with dr.resume_grad():
+            self.set_grad_in("point", _point_gradient(*self.inputs, gradient))
+            self.set_grad_in("packed", _lobe_gradient(*self.inputs, gradient))
+
+    def name(self):
+        return "sum_over_lobes"
+
+
+def shade(
+    normal: "mi.Vector3f",
+    view: "mi.Vector3f",
+    specular_albedo: "mi.Float",
+    roughness: "mi.Float",
+    lobes: "mi.TensorXf",
+) -> tuple["mi.Color3f", "mi.Color3f"]:
+    """Irradiance and specular radiance under all lobes `[N_l, 7]`; diffuse radiance is albedo/π × irradiance.
+
+    Unit vectors, `view` pointing away from the surface. Differentiable in every argument. Outside symbolic code the
+    gradients have the same bits on every run; inside a symbolic loop or call they go through Dr.Jit's own
+    differentiation of the loop over lobes, whose scatter-adds have no fixed order."""
+    point, count = specular_lobes(normal, view, roughness), lobe_count(lobes)
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        irradiance, white, grazing = _sum_over_lobes(point, lobes.array, count)
+    else:
+        irradiance, white, grazing = dr.custom(_SumOverLobes, lobes.array, count, *point)
+    return irradiance, dr.lerp(grazing, white, mi.Float(specular_albedo))
+
+
+def shade_tensor(
+    normal: "mi.TensorXf",
+    view: "mi.TensorXf",
+    specular_albedo: "mi.TensorXf | mi.Float",
+    roughness: "mi.Float",
+    lobes: "mi.TensorXf",
+) -> tuple["mi.TensorXf", "mi.TensorXf"]:
+    """`shade` on tensors: normals and views `[3, P]`, specular albedo `[P]` → irradiance and specular `[3, P]`."""
+    albedo = specular_albedo.array if isinstance(specular_albedo, mi.TensorXf) else specular_albedo
+    result = shade(mi.Vector3f(normal), mi.Vector3f(view), albedo, roughness, lobes)
+    return tuple(mi.TensorXf(value) for value in result)
+
+
+def shade_reference(normal, view, specular_albedo, roughness, lobes):
+    """`shade` by a Python loop over the lobes, differentiated by Dr.Jit: slow to compile, but nothing of its own."""
+    irradiance, specular = mi.Color3f(0.0), mi.Color3f(0.0)
+    for index in range(lobe_count(lobes)):
+        lobe = unpack_lobe(lobes.array, index)
+        irradiance += diffuse_irradiance(normal, *lobe)
+        specular += specular_radiance(normal, view, specular_albedo, roughness, *lobe)
+    return irradiance, specular
