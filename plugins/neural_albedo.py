@@ -2,9 +2,13 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.fields.appearance import (
+    albedo_refinement,
     albedo_refinement_cooperative,
     deform_cooperative,
+    diffuse_albedo,
     diffuse_albedo_cooperative,
+    refined_albedo,
+    specular_albedo,
     specular_albedo_cooperative,
 )
 from sira_mi.fields.mlp import layers, pack
@@ -82,23 +86,28 @@ class NeuralAlbedo(mi.Texture):
         self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
         self._to_local = to_local
 
-    def network(self):
-        """The albedo network's layers at the current parameters, for evaluation on tensors."""
+    def _network(self):
         column = mi.TensorXf(self.latent, (len(self.latent), 1))
         return layers(self.architecture.networks[f"{self.kind}_albedo"], self.weights, column)
 
-    def refinement_network(self):
-        """The refinement network's layers at the current parameters, for evaluation on tensors."""
+    def _refinement_network(self):
         return layers(self.architecture.networks["albedo_refinement"], self.refinement)
 
-    def is_refined(self) -> bool:
-        """Whether the refinement takes part: its weight is not zero, or is being optimised."""
-        return self._packed_refinement is not None
+    def evaluate_columns(self, x_ref, gamma):
+        """The albedo on tensors, outside of symbolic code: x_ref [3, N] and γ [N_γ, N] -> [3, N] or [1, N]."""
+        a = self.architecture
+        if self.kind == "specular":
+            return specular_albedo(self._network(), a.specular_octaves, x_ref)
+        base = diffuse_albedo(self._network(), a.albedo_octaves, x_ref, gamma)
+        if self._packed_refinement is None:
+            return base
+        fine = albedo_refinement(self._refinement_network(), a.refinement_octaves, x_ref, gamma)
+        return refined_albedo(base, fine, mi.TensorXf(self.k_r, (1, 1)))
 
     def _pack(self) -> None:
-        self._packed = pack(self.network())
+        self._packed = pack(self._network())
         refined = self.kind == "diffuse" and (dr.grad_enabled(self.k_r) or self.k_r.numpy().item() != 0)
-        self._packed_refinement = pack(self.refinement_network()) if refined else None
+        self._packed_refinement = pack(self._refinement_network()) if refined else None
         self._attached = self._gradients()
 
     def _gradients(self) -> tuple[bool, ...]:
@@ -116,7 +125,7 @@ class NeuralAlbedo(mi.Texture):
         if self._packed_refinement is None:
             return base
         fine = albedo_refinement_cooperative(self._packed_refinement, a.refinement_octaves, x_ref, gamma)
-        return [dr.minimum(dr.maximum(b + self.k_r * r, 0.0), 1.0) for b, r in zip(base, fine, strict=True)]
+        return [refined_albedo(b, r, self.k_r) for b, r in zip(base, fine, strict=True)]
 
     def eval(self, si, active=True):
         albedo = self._evaluate(si)

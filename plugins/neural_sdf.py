@@ -103,6 +103,14 @@ class NeuralSDF(mi.Mesh):
             self.architecture.sdf_octaves,
         )
 
+    def vertices(self) -> np.ndarray:
+        """Vertices [3, V] of the mesh in the field's coordinates."""
+        return self._x0.numpy()
+
+    def remesh_at_next_update(self) -> None:
+        """Makes the next update of the parameters extract the mesh, and starts the count of `remesh_every` there."""
+        self._updates = self.remesh_every - 1
+
     def refine(self, ray, t, active):
         """Exact hits of `ray` (Ray3f) near the proxy hits at t (Float), for the `active` lanes: (t of the exact hit,
         whether there is one). The field is evaluated outside of symbolic code."""
@@ -166,6 +174,7 @@ class NeuralSDF(mi.Mesh):
         self._bind_textures()
         self._updates += 1
         if self._updates % self.remesh_every == 0:
+            self._updates = 0
             self._extract()
             self._attach()
 

@@ -23,8 +23,8 @@ class SGEnvmap(mi.Emitter):
 
      * - lobes
        - |tensor|
-       - N_l × 7: axis (3, any length but zero), sharpness λ > 0, linear RGB amplitude (3, not negative). 1 to 4096 lobes.
-         (Default: one near-constant lobe of radiance 0.2)
+       - N_l × 7: axis (3, any length but zero), sharpness λ > 0, linear RGB amplitude (3, not negative); 1 to 4096
+         lobes. (Default: one near-constant lobe of radiance 0.2)
        - |exposed|, |differentiable|
 
      * - filename
@@ -45,14 +45,14 @@ class SGEnvmap(mi.Emitter):
        - |transform|
        - Rotation of the environment. (Default: none)
 
-    The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)); Mitsuba's `envmap` of the same light shows it in the same
-    directions. Light is sampled by choosing a lobe by the luminance of its energy and a direction from its von
+    The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)); Mitsuba's `envmap` of the same light shows it in the
+    same directions. Light is sampled by choosing a lobe by the luminance of its energy and a direction from its von
     Mises-Fisher density; the density is that of the whole mixture.
 
     It does not emit rays (`sample_ray`): particle tracers such as `ptracer` cannot use it. It needs an RGB or
     monochrome variant, and scenes much smaller than 1e5 units, the distance at which it places its light. Derivatives
-    go through the radiance, not through the sampling. Inside Mitsuba's symbolic loops the gradients of `lobes` are summed
-    by atomic additions: their last bits vary from run to run.
+    go through the radiance, not through the sampling. Inside Mitsuba's symbolic loops the gradients of `lobes` are
+    summed by atomic additions: their last bits vary from run to run.
 
     Source: the light model of eq. 8 of SIRA (Caselles et al. 2023), after PhySG (Zhang et al. 2021).
 

@@ -33,8 +33,8 @@ class SiraBSDF(mi.BSDF):
        - Weight of the specular term, not negative. (Default: 1)
        - |exposed|, |differentiable|
 
-    f = a/π + k_s D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴), F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h}
-    and Schlick-Smith's G with k = (r + 1)²/8: the formulas of `sira_mi.sg.brdf`, the same as in closed-form shading.
+    f = a/π + k_s D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴),
+    F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and Schlick-Smith's G with k = (r + 1)²/8: the formulas of `sira_mi.sg.brdf`, the same as in closed-form shading.
 
     One-sided; nest it in `twosided` for both. It is reciprocal. It does not conserve energy: the diffuse term is not
     reduced by what the specular term reflects, nor is the specular term normalised at grazing angles; with a = 0 and

@@ -2,13 +2,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.appearance import (
-    albedo_refinement,
-    diffuse_albedo,
-    refined_albedo,
-    specular_albedo,
-)
-from sira_mi.fields.columns import scatter_columns, to_columns
+from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.sdf import evaluate_in_chunks, normalised, signed_distance_and_slope, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.models.af_sm import physical_radiance
@@ -101,34 +95,24 @@ class SiraSG(mi.SamplingIntegrator):
     @staticmethod
     def _shade(head, bsdf, light, ray, t, index):
         """All of `_ROWS` at the hits `index`, as one tensor [13, n]; in chunks when nothing is differentiated."""
-        field, a = head.field(), head.architecture
+        field = head.field()
         local = head.to_local @ ray
         lobes = local_lobes(light, head)
         k_s = mi.TensorXf(bsdf.k_s, (1, 1))
-        neural = {k: isinstance(getattr(bsdf, k), NeuralAlbedo) for k in ("diffuse_albedo", "specular_albedo")}
-        networks = {k: getattr(bsdf, k).network() for k in neural if neural[k]}
-        refinement = bsdf.diffuse_albedo.refinement_network() if neural["diffuse_albedo"] else None
         rotation = mi.TensorXf(rotation_of(head.to_world))
 
-        def stock_albedo(texture, x, rows):
+        def albedo(texture, x, x_ref, gamma, rows):
+            if isinstance(texture, NeuralAlbedo):
+                return texture.evaluate_columns(x_ref, gamma)[0:rows, :]
             si = dr.zeros(mi.SurfaceInteraction3f, x.shape[1])
-            si.p = head.to_world @ mi.Point3f(x[0, :].array, x[1, :].array, x[2, :].array)
+            si.p = head.to_world @ from_columns(x, mi.Point3f)
             return to_columns(texture.eval(si) if rows == 3 else texture.eval_1(si))
 
         def columns(x, direction):
             _, gradient, x_ref, gamma = surface(field, x)
             normal = normalised(gradient)
-            if neural["diffuse_albedo"]:
-                diffuse = diffuse_albedo(networks["diffuse_albedo"], a.albedo_octaves, x_ref, gamma)
-                if bsdf.diffuse_albedo.is_refined():
-                    fine = albedo_refinement(refinement, a.refinement_octaves, x_ref, gamma)
-                    diffuse = refined_albedo(diffuse, fine, mi.TensorXf(bsdf.diffuse_albedo.k_r, (1, 1)))
-            else:
-                diffuse = stock_albedo(bsdf.diffuse_albedo, x, 3)
-            if neural["specular_albedo"]:
-                specular = specular_albedo(networks["specular_albedo"], a.specular_octaves, x_ref)
-            else:
-                specular = stock_albedo(bsdf.specular_albedo, x, 1)
+            diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
+            specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1)
             radiance = physical_radiance(diffuse, specular, normal, normalised(direction), bsdf.roughness, k_s, lobes)
             return dr.concat([*radiance, diffuse, specular, rotation @ normal], axis=0)
 

@@ -4,8 +4,8 @@
 
 Bald synthetic heads are rendered from the front and slightly aside, the portrait landmark network marks each render,
 and every mark is traced back onto the head. A landmark's place is the median over all renders of its rest-pose
-position, moved to the nearest surface point. The median distance of its marks from there, in mm, is stored and
-printed.
+position, made symmetric and moved to the nearest surface point. The median distance of its
+marks from there, in mm, is stored and printed.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
@@ -94,6 +95,15 @@ def consensus(marks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return middle, number, spread
 
 
+def symmetrise(positions: np.ndarray) -> np.ndarray:
+    """Positions [N, 3] averaged with their mirror partners in x, as the rest pose is symmetric; partners are the
+    assignment of mirrored to unmirrored positions with the least total distance."""
+    mirrored = positions * [-1, 1, 1]
+    _, partner = linear_sum_assignment(np.linalg.norm(mirrored[:, None] - positions, axis=2))
+    mutual = partner[partner] == np.arange(len(positions))
+    return np.where(mutual[:, None], (positions + mirrored[partner]) / 2, positions)
+
+
 def attach(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertex indices [N, 3] and barycentric weights [N, 3] of the rest surface's points nearest to positions [N, 3]."""
     rest, triangles = rest_surface(), head_topology()[0]
@@ -134,6 +144,7 @@ def main() -> None:
     valid = number >= FEWEST_MARKS
     if len(middle) != COUNT or not valid.any():
         raise InputError("the landmark network returned no usable marks")
+    middle[valid] = symmetrise(middle[valid])
     vertices, weights = attach(np.where(valid[:, None], middle, 0))
     rest = np.einsum("nk,nkd->nd", weights, rest_surface()[vertices])
     gap = np.linalg.norm(rest - middle, axis=1)[valid]
@@ -145,8 +156,9 @@ def main() -> None:
         spread_mm=(spread * MILLIMETRES_PER_UNIT).astype(np.float32),
     )
     millimetres = spread[valid] * MILLIMETRES_PER_UNIT
-    print(f"{len(marks)} renders, {valid.sum()} landmarks; distance of the marks from it: median {np.median(millimetres):.2f} mm,")
-    print(f"95% under {np.percentile(millimetres, 95):.2f} mm; moved onto the surface by up to {gap.max() * MILLIMETRES_PER_UNIT:.2f} mm")
+    print(f"{len(marks)} renders, {valid.sum()} landmarks; distance of the marks from their median position:")
+    print(f"median {np.median(millimetres):.2f} mm, 95% under {np.percentile(millimetres, 95):.2f} mm")
+    print(f"moved onto the surface by up to {gap.max() * MILLIMETRES_PER_UNIT:.2f} mm")
 
 
 if __name__ == "__main__":

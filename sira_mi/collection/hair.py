@@ -208,16 +208,14 @@ def _outward(vertices, normals, field, lower):
     return np.where(length > 1e-6, gradient / np.maximum(length, 1e-6), normals)
 
 
-def strand_shade(
+def strand_pattern(
     vertices: np.ndarray, points: np.ndarray, across: np.ndarray, random: np.random.Generator
-) -> np.ndarray:
-    """A brightness factor [N] around 1 that varies across the strands of the nearest sheet."""
-    tree = cKDTree(points)
-    _, near = tree.query(vertices, k=4)
-    stripes = random.standard_normal(4096)
-    fine = ndimage.gaussian_filter1d(stripes, 6, mode="wrap")
-    fine /= fine.std()
-    coarse = ndimage.gaussian_filter1d(random.standard_normal(4096), 40, mode="wrap")
-    coarse /= coarse.std()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fine and coarse noise [N], each of about unit variance, that varies across the strands of the nearest sheet."""
+    _, near = cKDTree(points).query(vertices, k=4)
     cell = (np.abs(across[near]) * 4096).astype(int) % 4096
-    return np.exp(0.16 * fine[cell].mean(1) + 0.14 * coarse[cell].mean(1))
+    patterns = []
+    for width in (6, 40):
+        stripes = ndimage.gaussian_filter1d(random.standard_normal(4096), width, mode="wrap")
+        patterns.append((stripes / stripes.std())[cell].mean(1))
+    return patterns[0], patterns[1]

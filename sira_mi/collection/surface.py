@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from scipy import sparse
 
-from sira_mi.collection.makehuman import BODY_VERTICES, LEFT_EYE, RIGHT_EYE, load_pack
+from sira_mi.collection.makehuman import LEFT_EYE, RIGHT_EYE, load_pack
 
 # Where the body below the pack's cut ends, in scene units: out of sight of every camera.
 BODY_FLOOR = -7.0
@@ -75,8 +75,8 @@ def head_topology() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     source, centre = [], []
     for loop in border_loops(quads):
         ring = first + len(source) + np.arange(len(loop))
-        source += list(loop) + [loop[0]]
-        centre += [False] * len(loop) + [True]
+        source += [*loop, loop[0]]
+        centre += [*(False for _ in loop), True]
         cap = first + len(source) - 1
         following, ring_following = np.roll(loop, -1), np.roll(ring, -1)
         triangles.append(np.stack([loop, following, ring_following], 1))
@@ -168,6 +168,3 @@ def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     )
     normals = incidence @ face
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-
-
-BODY_CONTROL = slice(0, BODY_VERTICES)

@@ -159,7 +159,8 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
         radiance.append(parts[0] + parts[1])
     difference = albedo - moved
     anchor = specular - settings.skin_specular
-    grey = dr.log(lobes[:, 4:7, :]) - dr.mean(dr.log(lobes[:, 4:7, :]), axis=1, mode=None)[:, None, :]
+    amplitude = dr.log(lobes[:, 4:7, :])
+    grey = amplitude - dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count))
     return {
         "color": losses.photometric_loss(dr.concat(radiance, axis=1), batch.colors),
         "embedding": losses.embedding_loss(z_a) + losses.embedding_loss(z_s) + losses.embedding_loss(z_l),

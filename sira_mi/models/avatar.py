@@ -7,7 +7,6 @@ every size is checked against the architecture before any array is used.
 
 import dataclasses
 import json
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +18,7 @@ from safetensors.numpy import save
 from sira_mi.errors import InputError
 from sira_mi.fields.encoding import encoded_size
 from sira_mi.fields.mlp import Architecture
+from sira_mi.files import write_through
 
 FORMAT = "sira-mi avatar 1"
 LANDMARKS = 468
@@ -134,14 +134,7 @@ def save_avatar(path: str | Path, avatar: Avatar) -> None:
     }
     tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
     data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot write the avatar {path}: {error.strerror or error}") from error
+    write_through(path, lambda file: file.write_bytes(data))
 
 
 def load_avatar(path: str | Path | None = None) -> Avatar:

@@ -1,6 +1,5 @@
 """Adam with checkpoints: Dr.Jit's optimizer, its state as NumPy arrays, and files that hold it."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from sira_mi.errors import InputError
+from sira_mi.files import write_through
 
 
 def adam(parameters: Mapping[str, np.ndarray], learning_rates: Mapping[str, float], beta_2: float = 0.99):
@@ -61,13 +61,8 @@ def restore_optimizer(optimizer, state: Mapping[str, np.ndarray]) -> None:
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
     """Writes a safetensors file under a temporary name, then renames it. Raises InputError when that fails."""
     arrays = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in arrays.items()}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(save(arrays, metadata=dict(metadata)))
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+    data = save(arrays, metadata=dict(metadata))
+    write_through(path, lambda file: file.write_bytes(data))
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

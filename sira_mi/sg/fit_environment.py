@@ -1,7 +1,7 @@
 """Fits spherical-Gaussian lobes to a latitude-longitude environment, keeping its total light.
 
-Compact sources far brighter than their surroundings ("suns") are taken out first, one lobe each, by their flux and their
-first moment at full resolution. The rest is reduced to at most 32 rows; axes and sharpnesses start from a spherical
+Compact sources far brighter than their surroundings ("suns") are taken out first, one lobe each, by their flux and
+their first moment at full resolution. The rest is reduced to at most 32 rows; axes and sharpnesses start from a spherical
 k-means of the radiance, amplitudes from non-negative least squares, and Adam refines all of them on the squared
 error, weighted by solid angle over the root of the radiance: midway between what irradiance needs (absolute error) and
 what reflections show (relative error). At last the amplitudes are solved again and each channel is scaled to its flux.
@@ -102,7 +102,7 @@ def _take_suns(image, settings):
 
 
 def _reduce(image, rows):
-    """Solid-angle-weighted box reduction to at most `rows` rows: directions `[P, 3]`, weights `[P]`, radiance `[P, 3]`."""
+    """Box reduction to at most `rows` rows: directions `[P, 3]`, solid angles `[P]`, radiance `[P, 3]`."""
     height, width = image.shape[:2]
     directions, solid_angle = pixel_directions(height, width)
     step = -(-height // rows)

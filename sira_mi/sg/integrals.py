@@ -1,11 +1,11 @@
 """Integrals of spherical Gaussians in closed form, stable in single precision for sharpness from 1e-3 to 1e5.
 
-Exact: the integral over the sphere, the product of two lobes (again a lobe) and their inner product. The integrals over a
-hemisphere, plain and cosine-weighted, have no elementary form. Here they are those of a normal distribution: for a
+Exact: the integral over the sphere, the product of two lobes (again a lobe) and their inner product. The integrals over
+a hemisphere, plain and cosine-weighted, have no elementary form. Here they are those of a normal distribution: for a
 direction ω drawn from the lobe, ω·n has the exactly known mean m = A(λ) ξ·n, and with a standard deviation s
 
     ∫ G (ω·n)₊ dω = (m Φ(m/s) + s φ(m/s)) ∫ G dω        (within 4e-4 of the value at ξ = n)
-    ∫ G [ω·n > 0] dω = Φ(t) ∫ G dω                      (within 3e-4 of the whole)
+    ∫ G [ω·n > 0] dω = Φ(t) ∫ G dω                      (within 5e-4 of the whole)
 
 Every s makes the first form positive, and exact in the sum over the two sides of a plane up to its even part; s(λ, ξ·n)
 and t(λ, ξ·n) are close to the planar limit, and small polynomials fitted to quadrature supply the rest. The idea of

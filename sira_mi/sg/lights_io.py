@@ -1,6 +1,6 @@
 """Files of lights: `lights.json` with lobes, and latitude-longitude OpenEXR images in Mitsuba's convention.
 
-    {"lobes": [{"axis": [x, y, z], "sharpness": λ, "amplitude": [r, g, b]}, ...]}
+{"lobes": [{"axis": [x, y, z], "sharpness": λ, "amplitude": [r, g, b]}, ...]}
 """
 
 import json
@@ -17,6 +17,7 @@ MAXIMUM_LOBES = 4096
 # Width and height of an environment image that is still read.
 _MAXIMUM_SIDE = 32768
 _MAXIMUM_JSON_BYTES = 4 << 20
+_FIELDS = (("axis", 3), ("sharpness", 1), ("amplitude", 3))
 
 
 def check_lobes(lobes: np.ndarray, source: str) -> np.ndarray:
@@ -72,11 +73,8 @@ def read_lights(path: str | Path) -> np.ndarray:
         source = f"{path}: lobe {index}"
         if not isinstance(entry, dict):
             raise InputError(f'{source} must be an object with "axis", "sharpness" and "amplitude"')
-        rows.append(sum((_numbers(entry, k, n, source) for k, n in _FIELDS), []))
+        rows.append([x for key, count in _FIELDS for x in _numbers(entry, key, count, source)])
     return check_lobes(np.array(rows), str(path))
-
-
-_FIELDS = (("axis", 3), ("sharpness", 1), ("amplitude", 3))
 
 
 def _replace(path: Path, write) -> None:

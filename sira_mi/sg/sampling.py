@@ -35,6 +35,54 @@ def sample_lobe(axis: "mi.Vector3f", sharpness: "mi.Float", sample: "mi.Point2f"
     return dr.normalize(mi.Frame3f(axis).to_world(local))
 
 
+def _sum_lobes(direction, packed, density, count):
+    """Radiance and mixture density in a direction: a symbolic loop over the lobes in each lane."""
+
+    def body(index, radiance, pdf):
+        axis, sharpness, amplitude = unpack_lobe(packed, index)
+        value = evaluate_lobe(direction, axis, sharpness, mi.Color3f(1.0)).x
+        weight = dr.gather(mi.Float, density, index)
+        return index + 1, radiance + amplitude * value, pdf + weight * dr.detach(value)
+
+    return dr.while_loop(
+        state=(mi.UInt32(0), mi.Color3f(0.0), mi.Float(0.0)),
+        cond=lambda index, radiance, pdf: index < count,
+        body=body,
+        labels=("index", "radiance", "pdf"),
+    )[1:]
+
+
+class _Mixture(dr.CustomOp):
+    """`_sum_lobes`, differentiated in reverse by a second loop over the lobes.
+
+    Dr.Jit cannot reverse a loop inside the virtual function calls through which integrators reach an emitter. The
+    second loop sends each lobe's derivative through its own gather, straight into the gradient of the lobes."""
+
+    def eval(self, direction, anchor, packed, density, count):
+        self.direction, self.density, self.count = direction, density, count
+        return _sum_lobes(direction, dr.detach(packed), density, count)
+
+    def backward(self):
+        gradient = self.grad_out()[0]
+
+        def body(index, total):
+            with dr.resume_grad():
+                direction = mi.Vector3f(self.direction)
+                dr.enable_grad(direction)
+                axis, sharpness, amplitude = unpack_lobe(self.packed, index)
+                radiance = evaluate_lobe(direction, axis, sharpness, amplitude)
+                dr.backward_from(dr.dot(radiance, gradient))
+                return index + 1, total + dr.grad(direction)
+
+        _, total = dr.while_loop(
+            state=(mi.UInt32(0), mi.Vector3f(0.0)),
+            cond=lambda index, total: index < self.count,
+            body=body,
+            labels=("index", "d_direction"),
+        )
+        self.set_grad_in("direction", total)
+
+
 class LobeMixture:
     """A set of lobes `[N_l, 7]` prepared for evaluation and sampling.
 
@@ -54,25 +102,10 @@ class LobeMixture:
             dr.eval(self.density)
 
     def evaluate(self, direction: "mi.Vector3f") -> tuple["mi.Color3f", "mi.Float"]:
-        """Radiance `[..., 3]` and the density of `sample`, per steradian, in a unit direction.
-
-        A symbolic loop over the lobes; `max_iterations` lets Dr.Jit differentiate it in reverse mode."""
-        packed, density = self.lobes.array, self.density
-
-        def body(index, radiance, pdf):
-            axis, sharpness, amplitude = unpack_lobe(packed, index)
-            value = evaluate_lobe(direction, axis, sharpness, mi.Color3f(1.0)).x
-            weight = dr.gather(mi.Float, density, index)
-            return index + 1, radiance + amplitude * value, pdf + weight * dr.detach(value)
-
-        _, radiance, pdf = dr.while_loop(
-            state=(mi.UInt32(0), mi.Color3f(0.0), mi.Float(0.0)),
-            cond=lambda index, radiance, pdf: index < self.count,
-            body=body,
-            labels=("index", "radiance", "pdf"),
-            max_iterations=self.count,
-        )
-        return radiance, pdf
+        """Radiance `[..., 3]` and the density of `sample`, per steradian, in a unit direction."""
+        # The gather attaches the operation to the lobes wherever it is recorded; its value is not used.
+        anchor = dr.gather(mi.Float, self.lobes.array, mi.UInt32(0))
+        return dr.custom(_Mixture, direction, anchor, self.lobes.array, self.density, self.count)
 
     def sample(self, sample: "mi.Point2f", active: "mi.Bool" = True) -> "mi.Vector3f":
         """A direction: a lobe by its share of the energy, then a direction in it."""

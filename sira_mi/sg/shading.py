@@ -2,7 +2,7 @@
 
 Diffuse radiance is albedo/π times the irradiance; specular radiance is the integral of light × f^s × (n·ω)₊ with f^s of
 `brdf.py`, by the lobes of `specular.py`. `specular_lobe` and `specular_radiance_physg` are PhySG's warped distribution
-and its closed form with one hemisphere integral instead of a two-term cosine: the baseline that `specular.py` improves.
+and its closed form with one cosine integral instead of a two-term cosine: the baseline that `specular.py` improves.
 """
 
 import math
@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.sg import brdf
-from sira_mi.sg.integrals import cosine_integral, hemisphere_integral, product
+from sira_mi.sg.integrals import cosine_integral, product
 from sira_mi.sg.lobes import lobe_count, unpack_lobe, unpack_raw
 from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
 
@@ -31,7 +31,7 @@ def diffuse_irradiance(
 def specular_lobe(
     normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float"
 ) -> tuple["mi.Vector3f", "mi.Float", "mi.Float"]:
-    """PhySG's warped distribution as a lobe of light directions: mirror axis, sharpness λ/(4 n·v), amplitude 1/(πr⁴)."""
+    """PhySG's warped distribution as a lobe of light directions: mirror axis, sharpness λ/(4 n·v), 1/(πr⁴)."""
     cosine = dr.maximum(dr.dot(normal, view), _MINIMUM_VIEW_COSINE)
     sharpness = brdf.distribution_sharpness(roughness)
     mirror = dr.normalize(2.0 * cosine * normal - view)
@@ -65,7 +65,7 @@ def specular_radiance_physg(
     cosine = dr.dot(normal, view)
     lobe_axis, lobe_sharpness, lobe_amplitude = specular_lobe(normal, view, roughness)
     joint_axis, joint_sharpness, log_amplitude = product(lobe_axis, lobe_sharpness, axis, sharpness)
-    integral = dr.exp(log_amplitude) * hemisphere_integral(dr.dot(normal, joint_axis), joint_sharpness)
+    integral = dr.exp(log_amplitude) * cosine_integral(dr.dot(normal, joint_axis), joint_sharpness)
     cos_mirror = dr.maximum(cosine, _MINIMUM_VIEW_COSINE)
     moment = dr.square(brdf.visibility(cos_mirror, roughness)) * brdf.fresnel(specular_albedo, cos_mirror)
     return amplitude * dr.select(cosine > 0.0, 0.25 * lobe_amplitude * moment * integral, 0.0)

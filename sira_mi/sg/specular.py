@@ -1,11 +1,11 @@
 """The specular reflectance at a shading point as lobes of light directions, and its integral against a light lobe.
 
 PhySG warps the normal distribution around the mirror direction and takes Fresnel and masking there; for rough surfaces
-seen at an angle the true integrand lies elsewhere, is wider, and is cut off by the horizon. Here a lobe has the exact
-integral over the hemisphere and the exact mean direction of the reflectance, from a table by view cosine and
-roughness. One lobe is too round for a light sharper than itself; the reflectance relative to the lobe, at the centre of
-the product with the light, corrects it in proportion to w = (λ_light / (λ_light + λ_lobe))². Broad lights keep the exact
-energy, and for sharp ones the result tends to reflectance × light.
+seen at an angle the true integrand lies elsewhere and is wider. Here a lobe times the light's cosine has the exact
+integral over the hemisphere and the exact mean direction of reflectance times cosine, from a table by view cosine and
+roughness. One lobe is too round for a light sharper than itself; the reflectance relative to the lobe, at the centre
+of the product with the light, corrects it in proportion to w = (λ_light / (λ_light + λ_lobe))². Broad lights keep the
+exact energy, and for sharp ones the result tends to reflectance × irradiance.
 """
 
 import math
@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.sg import brdf, specular_table
-from sira_mi.sg.integrals import hemisphere_integral, product
+from sira_mi.sg.integrals import cosine_integral, product
 
 # Range of the roughness in the tables.
 _MINIMUM_ROUGHNESS = 0.2
@@ -76,7 +76,7 @@ def specular_lobes(normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Fl
         energy, turn, sharpness = (_evaluate_table(table, cosine_terms, roughness_terms) for table in tables)
         axis = dr.normalize(mirror + turn * (cosine * mirror - normal))
         sharpness = base * dr.exp(sharpness)
-        amplitude = dr.exp(energy) / hemisphere_integral(dr.dot(normal, axis), sharpness)
+        amplitude = dr.exp(energy) / cosine_integral(dr.dot(normal, axis), sharpness)
         lobes += [axis, sharpness, dr.select(above, amplitude, 0.0), dr.log(factor / amplitude)]
     return SpecularLobes(normal, view, mi.Float(roughness), *lobes)
 
@@ -84,7 +84,7 @@ def specular_lobes(normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Fl
 def specular_integrals(
     lobes: SpecularLobes, axis: "mi.Vector3f", sharpness: "mi.Float"
 ) -> tuple["mi.Float", "mi.Float"]:
-    """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ dω of one light lobe for F = 1 and for F = P, steradian-free radiance ratios."""
+    """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ dω of one light lobe, for F = 1 and for F = P."""
     white = _integral(lobes, "white", axis, sharpness)
     return white, _integral(lobes, "grazing", axis, sharpness)
 
@@ -104,4 +104,4 @@ def _integral(lobes, part, axis, sharpness):
         ratio += brdf.log_fresnel_weight(dr.dot(lobes.view, half))
     weight = dr.square(sharpness / (sharpness + lobe_sharpness))
     correction = weight * dr.clip(ratio, -_MAXIMUM_CORRECTION, _MAXIMUM_CORRECTION)
-    return amplitude * dr.exp(log_amplitude + correction) * hemisphere_integral(cosine, joint_sharpness)
+    return amplitude * dr.exp(log_amplitude + correction) * cosine_integral(cosine, joint_sharpness)

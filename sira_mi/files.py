@@ -1,0 +1,47 @@
+"""Writing files so that none is ever left half-written, and the image formats that the project writes."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from PIL import Image
+
+from sira_mi.errors import InputError
+
+
+def write_through(path: str | Path, write: Callable[[Path], None]) -> None:
+    """Calls `write` with a temporary path of the same ending beside `path`, then renames it.
+
+    Raises InputError when the place cannot be written or is full; nothing is left behind then."""
+    path = Path(path)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place or free some") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_exr(path: str | Path, image: np.ndarray) -> None:
+    """A 32-bit OpenEXR of an image [H, W, 3] (channels RGB) or [H, W] (channel Y)."""
+    pixels = np.ascontiguousarray(image, np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+
+    def write(file: Path) -> None:
+        try:
+            with OpenEXR.File(header, {"RGB" if pixels.ndim == 3 else "Y": pixels}) as output:
+                output.write(str(file))
+        except RuntimeError as error:
+            raise OSError(f"OpenEXR: {error}") from error
+
+    write_through(path, write)
+
+
+def write_png(path: str | Path, values: np.ndarray) -> None:
+    """A PNG of display values in [0, 1], [H, W, 3] or [H, W]."""
+    picture = Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
+    write_through(path, lambda file: picture.save(file, format="PNG"))

@@ -1,0 +1,238 @@
+"""A whole fit: photo -> portrait -> geometry -> appearance -> avatar folder."""
+
+import contextlib
+import hashlib
+import json
+import resource
+import sys
+import time
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+import sira_mi
+from sira_mi.errors import InputError
+from sira_mi.files import write_exr, write_png, write_through
+from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, FitSettings
+from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
+
+# Files of an unfinished fit, inside the output folder.
+_WORK = ".fit"
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What the command line asks for; paths or None."""
+
+    photo: Path | None
+    out: Path
+    quality: str = "standard"
+    seed: int = 0
+    example: bool = False  # the portrait of scikit-image instead of `photo`
+    resume: bool = False
+    mask: Path | None = None
+    camera: Path | None = None
+    face: int | None = None
+    prior: Path | None = None
+    variant: str = "llvm_ad_rgb"
+
+
+def fit_photo(request: FitRequest) -> int:
+    """Fits an avatar and writes its folder; returns the exit code, 130 after an interrupt that left an avatar.
+
+    Raises InputError for anything wrong with the photo, the options or the output folder."""
+    started = time.monotonic()
+    set_variant(request.variant)
+    settings = QUALITIES[request.quality]
+    prior_path = request.prior or PRIOR
+    prior = load_avatar(prior_path)
+    work = prepare_folder(request.out)
+    photo = write_example(work) if request.example else request.photo
+
+    from sira_mi.portrait.portrait import PortraitSettings, make_portrait
+
+    portrait = make_portrait(
+        photo,
+        PortraitSettings(working_size=settings.working_size),
+        prior.tensors["landmarks"],
+        mask_path=request.mask,
+        camera_path=request.camera,
+        face=request.face,
+    )
+    for note in portrait.notes:
+        print(f"note: {note}", file=sys.stderr)
+    seconds_portrait = time.monotonic() - started
+
+    identity = identify(portrait, settings, request.seed, prior_path)
+    checkpoint = work / "checkpoint.safetensors"
+    if request.resume and checkpoint.exists():
+        progress = load_progress(checkpoint, identity)
+        print(f"note: going on at stage {progress.stage + 1}, step {progress.step}", file=sys.stderr)
+    else:
+        progress = Progress(initial_tensors(prior, request.seed))
+
+    problems = stage_problems(portrait, prior, prior_path, work, settings)
+    stages = [(problems[kind], stage) for kind, stage in settings.stages]
+    interrupted = False
+    try:
+        run_stages(stages, progress, settings.block, request.seed, lambda p: save_progress(checkpoint, p, identity))
+    except KeyboardInterrupt:
+        interrupted = True
+        print("interrupted: writing what there is; --resume goes on from the last checkpoint", file=sys.stderr)
+
+    avatar = finished_avatar(prior, progress, settings)
+    report = {
+        "quality": request.quality,
+        "seed": request.seed,
+        "complete": not interrupted,
+        "seconds": {"portrait": round(seconds_portrait, 2), **{k: round(v, 2) for k, v in progress.seconds.items()}},
+        "losses": progress.losses,
+        "settings": asdict(settings),
+        "notes": list(portrait.notes),
+        "versions": {"sira_mi": sira_mi.__version__, **{p: version(p) for p in ("mitsuba", "drjit", "numpy")}},
+    }
+    write_folder(request.out, portrait, avatar, settings, report, started)
+    if not interrupted:
+        for file in work.iterdir():
+            file.unlink()
+        work.rmdir()
+    return 130 if interrupted else 0
+
+
+def set_variant(variant: str) -> None:
+    """Sets a Mitsuba variant with automatic differentiation. Raises InputError for any other."""
+    usable = [v for v in mi.variants() if "_ad_" in v and v.endswith("rgb")]
+    if variant not in usable:
+        raise InputError(f"no variant {variant}; this Mitsuba has {', '.join(usable)}")
+    mi.set_variant(variant)
+
+
+def prepare_folder(out: Path) -> Path:
+    """Makes the output folder and its work folder, and checks that files can be written there."""
+    work = out / _WORK
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the output folder {out}: {error.strerror}; choose another --out") from error
+    write_through(work / "probe", lambda file: file.write_bytes(b"0"))
+    (work / "probe").unlink()
+    return work
+
+
+def write_example(work: Path) -> Path:
+    """The public-domain portrait inside scikit-image, as a PNG in the work folder."""
+    import skimage.data
+
+    path = work / "example.png"
+    write_png(path, skimage.data.astronaut() / 255)
+    return path
+
+
+def identify(portrait, settings: FitSettings, seed: int, prior_path: Path) -> str:
+    """A digest of all that a fit depends on; a checkpoint goes on only with the same."""
+    digest = hashlib.sha256()
+    for array in (portrait.image, portrait.mask, portrait.landmarks, portrait.camera.K, portrait.camera.world_to_camera):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(json.dumps(asdict(settings), sort_keys=True).encode())
+    digest.update(str(seed).encode())
+    digest.update(prior_path.read_bytes())
+    return digest.hexdigest()
+
+
+def initial_tensors(prior: Avatar, seed: int) -> dict[str, np.ndarray]:
+    """The prior's tensors, latents drawn with small variance about the mean (section 3.2.1)."""
+    rng = np.random.default_rng([seed, 1 << 20])
+    tensors = dict(prior.tensors)
+    for name in ("z_sdf", "z_r", "z_a", "z_s"):
+        tensors[name] = (tensors[name] + 0.01 * rng.standard_normal(tensors[name].shape)).astype(np.float32)
+    landmarks = tensors.pop("landmarks")
+    assert landmarks.shape == prior.tensors["landmarks"].shape
+    return tensors
+
+
+def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settings: FitSettings) -> dict:
+    """Per kind of stage a function from the current tensors to the stage's problem; a problem is made once and serves
+    the stages that follow each other."""
+    from sira_mi.fit.appearance import AppearanceProblem
+    from sira_mi.fit.geometry import GeometryProblem
+
+    made: dict[str, object] = {}
+
+    def geometry(tensors):
+        if GEOMETRY not in made:
+            made[GEOMETRY] = GeometryProblem(portrait, prior, str(prior_path), settings)
+        return made[GEOMETRY]
+
+    def appearance(tensors):
+        if APPEARANCE not in made:
+            made.clear()
+            current = prior.replaced(**{k: v for k, v in tensors.items() if k in prior.tensors})
+            path = work / "geometry.safetensors"
+            save_avatar(path, current)
+            made[APPEARANCE] = AppearanceProblem(portrait, prior, str(path), settings)
+        return made[APPEARANCE]
+
+    return {GEOMETRY: geometry, APPEARANCE: appearance}
+
+
+def finished_avatar(prior: Avatar, progress: Progress, settings: FitSettings) -> Avatar:
+    """The avatar at the fit's last parameters, its light decoded to lobes; k_s and k_r are those of the stages that
+    were reached."""
+    from dataclasses import replace
+
+    from sira_mi.fit.appearance import decode_lobes
+
+    tensors = {k: v for k, v in progress.tensors.items() if k in prior.tensors}
+    floats = {k: mi.Float(tensors[k]) for k in ("illumination", "z_l")}
+    tensors["lobes"] = decode_lobes(prior, floats).numpy()
+    reached = [stage for _, stage in settings.stages[: progress.stage + 1]]
+    k_s = reached[-1].k_s[1] if progress.stage < len(settings.stages) else settings.stages[-1][1].k_s[1]
+    return replace(prior.replaced(**tensors), k_s=k_s, k_r=reached[-1].k_r)
+
+
+def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float) -> None:
+    """Writes everything that a fit leaves behind."""
+    from sira_mi.fit import output
+    from sira_mi.scene import orbited
+    from sira_mi.sg.fit_environment import render_environment
+    from sira_mi.sg.lights_io import write_lights
+
+    begun = time.monotonic()
+    avatar_path = out / "avatar.safetensors"
+    save_avatar(avatar_path, avatar)
+    lobes = avatar.tensors["lobes"]
+    write_lights(out / "lights.json", lobes)
+    write_exr(out / "lights.exr", render_environment(lobes, 128))
+    write_png(out / "input.png", output.preview("final", portrait.image, portrait.mask))
+    output.write_scene(out / "scene.xml", portrait.camera)
+
+    scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel)
+    layers = output.render_layers(scene)
+    with contextlib.suppress(FileExistsError):
+        (out / "renders").mkdir()
+    output.write_renders(out / "renders", layers)
+    output.write_mesh(out / "mesh.ply", scene.shapes()[0])
+
+    turned = []
+    for yaw in (-30, 30):
+        view = output.avatar_scene(str(avatar_path), orbited(portrait.camera, yaw), output.SECOND_LIGHT, settings.voxel)
+        turned.append(output.preview("final", output.render_layers(view, 4)["final"], portrait.mask))
+    box = output.head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
+    write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))
+
+    inside = portrait.mask * (layers["mask"] > 0.99)
+    report["psnr_inside_mask_db"] = round(output.psnr_inside(layers["final"], portrait.image, inside), 2)
+    report["camera"] = portrait.camera.to_dict()
+    report["seconds"]["output"] = round(time.monotonic() - begun, 2)
+    report["seconds"]["total"] = round(time.monotonic() - started, 2)
+    report["peak_memory_megabytes"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    output.write_report(out / "avatar.json", report)
+    print(
+        f"{out}: {report['psnr_inside_mask_db']:.1f} dB inside the mask, {report['seconds']['total']:.0f} s, "
+        f"{report['peak_memory_megabytes']} MB",
+        file=sys.stderr,
+    )

@@ -1,0 +1,201 @@
+"""The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF stays.
+
+Colour and mask losses go through the `sira_radiance` integrator by `mi.render`; eikonal, landmark and regularising
+terms are evaluated on the field."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.fields.mlp import layers
+from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
+from sira_mi.fit.rays import modelled_pixels, window_around, window_camera, window_pixels
+from sira_mi.fit.settings import FitSettings, Stage
+from sira_mi.models import losses
+from sira_mi.models.avatar import Avatar
+from sira_mi.portrait.camera import Camera, landmark_weights
+from sira_mi.portrait.portrait import Portrait
+from sira_mi.scene import principal_point_offset, sensor
+
+_PARAMETERS = {
+    "z_sdf": "head.z_sdf",
+    "deformation": "head.deformation",
+    "z_r": "integrator.z_r",
+    "rendering": "integrator.rendering",
+}
+# Fixed-point steps that find a landmark's place from its place in reference space.
+_LANDMARK_STEPS = 4
+_STAY_POINTS = 256
+
+
+class GeometryProblem:
+    """The losses of the geometry stages for one portrait, starting from `avatar` (written at `avatar_path`)."""
+
+    def __init__(self, portrait: Portrait, avatar: Avatar, avatar_path: str, settings: FitSettings):
+        self.portrait, self.avatar, self.settings = portrait, avatar, settings
+        size = round(settings.rays**0.5)
+        self.valid = modelled_pixels(portrait.camera)
+        self.windows = self._windows(size)
+        self.scene = mi.load_dict(self._description(avatar_path, size))
+        self.head = self.scene.shapes()[0]
+        self.parameters = mi.traverse(self.scene)
+        self.head.remesh_every = 1 << 30
+        mask = np.where(self.valid, portrait.mask, 0)
+        self.target = np.concatenate([portrait.image, mask[..., None]], axis=-1).astype(np.float32)
+        self.landmarks = self._landmarks(avatar)
+
+    def _windows(self, size: int):
+        rows, columns = np.nonzero(self.valid & (self.portrait.mask > 0.05))
+        if len(rows) == 0:
+            rows, columns = np.nonzero(self.valid)
+        margin = 0.06 * max(np.ptp(rows), np.ptp(columns))
+        whole = (columns.min() - margin, rows.min() - margin, columns.max() + margin, rows.max() + margin)
+        known = self.portrait.landmarks[np.isfinite(self.portrait.landmarks).all(axis=1)]
+        if len(known) == 0:
+            return [window_around(*whole, size)]
+        low, high = known.min(axis=0), known.max(axis=0)
+        reach = 0.15 * (high - low)
+        return [window_around(*whole, size), window_around(*(low - reach), *(high + reach), size)]
+
+    def _description(self, avatar_path: str, size: int) -> dict:
+        camera = window_camera(self.portrait.camera, self.windows[0], (0, 0))
+        pixel_centres = {"type": "stratified", "sample_count": 1, "jitter": False}
+        return {
+            "type": "scene",
+            "sensor": sensor(camera, pixel_centres),
+            "integrator": {"type": "sira_radiance", "avatar": avatar_path},
+            "head": {"type": "neural_sdf", "avatar": avatar_path, "voxel": self.settings.voxel},
+        }
+
+    def _field(self, tensors: dict) -> SdfField:
+        networks = self.avatar.architecture.networks
+        z_sdf = mi.TensorXf(tensors["z_sdf"], (len(tensors["z_sdf"]), 1))
+        return SdfField(
+            layers(networks["deformation"], tensors["deformation"], z_sdf),
+            layers(networks["reference"], mi.Float(self.avatar.tensors["reference"])),
+            self.avatar.architecture.sdf_octaves,
+        )
+
+    def _landmarks(self, avatar: Avatar) -> dict | None:
+        """Landmarks that both the head and the photo have: places in reference space, pixels, weights."""
+        mean = avatar.tensors["landmarks"]
+        known = np.isfinite(mean).all(axis=1) & np.isfinite(self.portrait.landmarks).all(axis=1)
+        if known.sum() < 6:
+            return None
+        zero = {"z_sdf": mi.Float(np.zeros_like(avatar.tensors["z_sdf"])), "deformation": mi.Float(avatar.tensors["deformation"])}
+        field = self._field(zero)
+        x_ref = evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
+        pixels = self.portrait.landmarks[known].T.astype(np.float32)
+        weights = landmark_weights(len(mean))[known].astype(np.float32)
+        return {
+            "x_ref": mi.TensorXf(x_ref),
+            "x": mean[known].T.astype(np.float32),
+            "pixels": mi.TensorXf(pixels),
+            "weights": mi.TensorXf(weights[None] / weights.sum()),
+            "face_size": float(np.ptp(pixels[1])),
+        }
+
+    def refresh(self, tensors: dict[str, np.ndarray]) -> None:
+        """Extracts the mesh that rays start from at the current parameters."""
+        self.head.remesh_at_next_update()
+        for name, key in _PARAMETERS.items():
+            self.parameters[key] = mi.Float(tensors[name])
+        self.parameters.set_dirty("head.z_sdf")
+        self.parameters.update()
+        self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
+        if self.landmarks is not None:
+            self._place_landmarks(self._field(self._fixed))
+
+    def _place_landmarks(self, field: SdfField) -> None:
+        x_ref = self.landmarks["x_ref"]
+        with dr.suspend_grad():
+            x = mi.TensorXf(self.landmarks["x"])
+            for _ in range(_LANDMARK_STEPS):
+                x = x - 0.8 * (deform(field, x)[0] - x_ref)
+                dr.eval(x)
+        self.landmarks["placed"] = x
+
+    def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
+        weights = self.settings.geometry
+        current = {**self._fixed, **tensors}
+        field = self._field(current)
+        color, mask = self._image_losses(tensors, stage, step, rng)
+        _, gradient, _, _ = surface(field, self._eikonal_points(rng))
+        terms = {
+            "color": weights.color * color,
+            "mask": weights.mask * mask,
+            "eikonal": weights.eikonal * losses.eikonal_loss(gradient),
+            "embedding": weights.embedding * (_square(current["z_sdf"]) + _square(current["z_r"])),
+        }
+        if self.landmarks is not None:
+            terms["landmark"] = weights.landmark * self._landmark_loss(field)
+        if "deformation" in tensors:
+            terms["stay"] = weights.stay * self._stay_loss(field, current, rng)
+        return terms
+
+    def _image_losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator):
+        """Photometric and mask loss on the rays of one window."""
+        window = self.windows[step % len(self.windows)]
+        shift = tuple(int(s) for s in rng.integers(window.stride, size=2))
+        camera = window_camera(self.portrait.camera, window, shift)
+        x, y = principal_point_offset(camera)
+        self.parameters["sensor.principal_point_offset_x"] = x
+        self.parameters["sensor.principal_point_offset_y"] = y
+        self.parameters["sensor.x_fov"] = float(np.degrees(2 * np.arctan(camera.width / (2 * camera.K[0, 0]))))
+        for name, value in tensors.items():
+            self.parameters[_PARAMETERS[name]] = value
+        self.parameters.update()
+
+        columns, rows = window_pixels(window, shift)
+        height, width = self.valid.shape
+        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
+        usable = (inside & self.valid[rows, columns]).astype(np.float32)
+        target = self.target[rows, columns]
+
+        image = mi.render(self.scene, self.parameters, spp=1, seed=0)
+        hit = dr.detach(image[:, :, 3:4]).numpy()
+        covered = usable[..., None] * hit * (target[..., 3:4] > 0.5)
+        difference = dr.abs(losses.display(image[:, :, 0:3]) - losses.display(mi.TensorXf(target[..., :3])))
+        color = dr.sum(difference * mi.TensorXf(covered), axis=None) / (3 * max(covered.sum(), 1.0))
+
+        # IDR's mask loss, BCE(σ(−α min f)) / α, from the logit −α min f.
+        alpha = stage.mask_sharpness
+        logit = -alpha * image[:, :, 5:6]
+        entropy = dr.maximum(logit, 0.0) + dr.log(1 + dr.exp(-dr.abs(logit))) - logit * mi.TensorXf(target[..., 3:4])
+        open_rays = usable[..., None] * (1 - covered)
+        return color, dr.sum(entropy * mi.TensorXf(open_rays), axis=None) / (alpha * max(usable.sum(), 1.0))
+
+    def _eikonal_points(self, rng: np.random.Generator):
+        """Half uniform in the domain, half near the mesh; [3, points]."""
+        half = self.settings.points // 2
+        uniform = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (half, 3))
+        vertices = self.head.vertices()
+        near = vertices[:, rng.integers(vertices.shape[1], size=half)].T + 0.1 * rng.standard_normal((half, 3))
+        return mi.TensorXf(np.ascontiguousarray(np.concatenate([uniform, near]).T, dtype=np.float32))
+
+    def _landmark_loss(self, field: SdfField):
+        """Weighted mean reprojection error of the landmarks, in face sizes. A landmark is where the field maps to its
+        place in reference space; one fixed-point step from there carries the derivative."""
+        x = self.landmarks["placed"]
+        x = x - (deform(field, x)[0] - self.landmarks["x_ref"])
+        camera: Camera = self.portrait.camera
+        matrix = camera.K @ camera.world_to_camera[:3]
+        projected = mi.TensorXf(matrix[:, :3].astype(np.float32)) @ x + mi.TensorXf(matrix[:, 3:].astype(np.float32))
+        pixels = projected[0:2, :] / projected[2:3, :]
+        offset = (pixels - self.landmarks["pixels"]) / self.landmarks["face_size"]
+        length = dr.sqrt(dr.sum(offset * offset, axis=0) + 1e-6)
+        return dr.sum(dr.reshape(length, (1, -1)) * self.landmarks["weights"], axis=None)
+
+    def _stay_loss(self, field: SdfField, tensors: dict, rng: np.random.Generator):
+        """Mean |δ − δ₀| over random points of the domain, δ₀ the prior's deformation network at the same latent: what
+        the photo does not show stays what the prior says."""
+        points = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_STAY_POINTS, 3)).astype(np.float32)
+        x = mi.TensorXf(np.ascontiguousarray(points.T))
+        prior = {"z_sdf": dr.detach(tensors["z_sdf"]), "deformation": mi.Float(self.avatar.tensors["deformation"])}
+        return losses.mean(dr.abs(deform(field, x)[0] - deform(self._field(prior), x)[0]))
+
+
+def _square(latent):
+    return dr.sum(latent * latent, axis=None)

@@ -1,0 +1,101 @@
+"""All settings of a fit, as data: what each stage optimises, for how long, and how its losses are weighed."""
+
+from dataclasses import dataclass, field
+
+GEOMETRY, APPEARANCE = "geometry", "appearance"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stretch of optimisation."""
+
+    name: str
+    steps: int
+    rates: dict[str, float]  # learning rate of every optimised avatar tensor; all others are frozen
+    mask_sharpness: float = 50.0  # α of the mask loss, per scene unit (IDR: 50 doubling to 1600 on a unit sphere)
+    k_s: tuple[float, float] = (0.0, 0.0)  # weight of the specular BRDF, first and last step, eq. 8
+    k_r: float = 0.0  # weight of the albedo refinement, eq. 11
+
+
+@dataclass(frozen=True)
+class GeometryWeights:
+    """Weights of the losses of section 3.2.1 (IDR: colour 1, mask 100 over a sum of BCE / α, eikonal 0.1)."""
+
+    color: float = 1.0
+    mask: float = 2.0  # on a mean over rays, in scene units
+    eikonal: float = 0.05
+    landmark: float = 0.4  # on reprojection errors in face sizes
+    embedding: float = 2e-4  # on ‖z‖², keeps latents where the prior was trained
+    stay: float = 0.5  # on mean |δ − δ₀| against the prior's deformation network
+
+
+@dataclass(frozen=True)
+class AppearanceWeights:
+    """Weights of the losses of section 3.2.2."""
+
+    lambda_8: float = 0.5  # eq. 13, refinement in shadows
+    lambda_9: float = 1.0  # eq. 13, refinement in reflections
+    refinement: float = 0.05  # eq. 12
+    embedding: float = 3e-4  # on ‖z‖²
+    white_light: float = 0.02  # mean squared log-chroma of the lobes: the prior on the light's colour
+    smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """A whole fit."""
+
+    quality: str
+    working_size: int  # longest side of the working image, pixels
+    rays: int  # of the geometry stages, a step
+    points: int  # of the eikonal loss, a step
+    pixels: int  # of the appearance stages, a step
+    voxel: float  # of the mesh during the fit, scene units
+    final_voxel: float  # of the exported mesh, scene units
+    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY or APPEARANCE, stage), in order
+    geometry: GeometryWeights = field(default_factory=GeometryWeights)
+    appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
+    block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
+
+
+def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
+    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to `scale`."""
+
+    def steps(count: int) -> int:
+        return max(20, round(count * scale))
+
+    shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
+    return (
+        (GEOMETRY, Stage("latents", steps(160), dict.fromkeys(shape, 1e-2), mask_sharpness=30)),
+        (GEOMETRY, Stage("networks", steps(240), _rates(shape, 1e-3, networks, 4e-4), mask_sharpness=60)),
+        (GEOMETRY, Stage("details", steps(120), _rates(shape, 3e-4, networks, 1.5e-4), mask_sharpness=240)),
+        (APPEARANCE, Stage("light", steps(120), {"z_l": 2e-2, "illumination": 1e-3})),
+        (APPEARANCE, Stage("albedo", steps(120), {"z_l": 5e-3, "illumination": 5e-4, "z_a": 2e-2})),
+        (
+            APPEARANCE,
+            Stage(
+                "speculars", steps(120), {"z_l": 5e-3, "illumination": 5e-4, "z_a": 5e-3, "z_s": 1e-2}, k_s=(0.0, 1.0)
+            ),
+        ),
+        (
+            APPEARANCE,
+            Stage(
+                "refinement",
+                steps(500),
+                {"z_l": 1e-3, "illumination": 1e-4, "z_s": 2e-3, "albedo_refinement": 2e-3},
+                k_s=(1.0, 1.0),
+                k_r=1.0,
+            ),
+        ),
+    )
+
+
+def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float) -> dict[str, float]:
+    return {**dict.fromkeys(first, first_rate), **dict.fromkeys(second, second_rate)}
+
+
+QUALITIES = {
+    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.04, _stages(1.0)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.03, _stages(2.5)),
+}
