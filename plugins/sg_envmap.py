@@ -1,5 +1,7 @@
 """The emitter `sg_envmap`: an environment of spherical Gaussians."""
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -71,9 +73,9 @@ class SGEnvmap(mi.Emitter):
         self.m_flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.SpatiallyVarying
         self.scale = mi.Float(props.get("scale", 1.0))
         count = props.get("lobe_count", 64)
-        if props.has_property("lobes") and props.has_property("filename"):
+        if "lobes" in props and "filename" in props:
             raise InputError("sg_envmap: give either lobes or filename, not both")
-        if props.has_property("filename"):
+        if "filename" in props:
             lobes = self._read(props["filename"], count)
         else:
             lobes = check_lobes(np.array(props.get("lobes", mi.TensorXf(DEFAULT_LOBES))), "sg_envmap")
@@ -82,9 +84,8 @@ class SGEnvmap(mi.Emitter):
 
     @staticmethod
     def _read(filename, count):
-        path = mi.file_resolver().resolve(filename)
-        suffix = path.extension().lower()
-        path = str(path)
+        path = str(mi.file_resolver().resolve(filename))
+        suffix = Path(path).suffix.lower()
         if suffix == ".json":
             return read_lights(path)
         if suffix == ".exr":
@@ -122,7 +123,7 @@ class SGEnvmap(mi.Emitter):
         ds.emitter = mi.EmitterPtr(self)
         radiance, pdf = self._evaluate(direction)
         ds.pdf = dr.select(active, pdf, 0.0)
-        active &= pdf > 0.0
+        active = active & (pdf > 0.0)
         return ds, dr.select(active, radiance / dr.select(pdf > 0.0, pdf, 1.0), 0.0)
 
     def pdf_direction(self, it, ds, active=True):

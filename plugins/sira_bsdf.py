@@ -34,7 +34,8 @@ class SiraBSDF(mi.BSDF):
        - |exposed|, |differentiable|
 
     f = a/π + k_s D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴),
-    F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and Schlick-Smith's G with k = (r + 1)²/8: the formulas of `sira_mi.sg.brdf`, the same as in closed-form shading.
+    F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and Schlick-Smith's G with k = (r + 1)²/8: the formulas of
+    `sira_mi.sg.brdf`, as in closed-form shading.
 
     One-sided; nest it in `twosided` for both. It is reciprocal. It does not conserve energy: the diffuse term is not
     reduced by what the specular term reflects, nor is the specular term normalised at grazing angles; with a = 0 and
@@ -102,7 +103,7 @@ class SiraBSDF(mi.BSDF):
     def _value(self, ctx, si, wo, active):
         """f · cos of the light direction."""
         cos_light = mi.Frame3f.cos_theta(wo)
-        active &= (mi.Frame3f.cos_theta(si.wi) > 0.0) & (cos_light > 0.0)
+        active = active & ((mi.Frame3f.cos_theta(si.wi) > 0.0) & (cos_light > 0.0))
         glossy, diffuse = self._components(ctx, active)
         specular = brdf.specular_brdf(
             mi.Vector3f(0, 0, 1), si.wi, wo, self.specular_albedo.eval_1(si, active), self.roughness
@@ -112,13 +113,13 @@ class SiraBSDF(mi.BSDF):
 
     def _density(self, ctx, si, wo, active):
         with dr.suspend_grad():
-            active &= (mi.Frame3f.cos_theta(si.wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0)
+            active = active & ((mi.Frame3f.cos_theta(si.wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0))
             glossy = brdf.reflected_density(mi.Vector3f(0, 0, 1), si.wi, wo, self.roughness)
             share = self._glossy_share(ctx, si, active)
             return dr.select(active, dr.lerp(mi.warp.square_to_cosine_hemisphere_pdf(wo), glossy, share), 0.0)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
-        active &= mi.Frame3f.cos_theta(si.wi) > 0.0
+        active = active & (mi.Frame3f.cos_theta(si.wi) > 0.0)
         share = self._glossy_share(ctx, si, active)
         glossy = sample1 < share
         with dr.suspend_grad():
@@ -132,7 +133,7 @@ class SiraBSDF(mi.BSDF):
         bs.sampled_type = dr.select(
             glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
         )
-        active &= bs.pdf > 0.0
+        active = active & (bs.pdf > 0.0)
         value = self._value(ctx, si, wo, active) / dr.select(active, bs.pdf, 1.0)
         return bs, dr.select(active, value, 0.0)
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sira_mi.collection import build as building
 from sira_mi.collection import hair, landmarks, makehuman, person, render, scene, skin, surface
 from sira_mi.collection.annotate_landmarks import attach, symmetrise
-from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
 from sira_mi.errors import InputError
 
 SMALL = scene.SceneSettings(points=1500, volume=1200, render=render.RenderSettings(size=48, samples=4))
@@ -253,11 +253,14 @@ def test_signed_distance_agrees_with_points_and_normals(arrays):
 
 
 def test_frontal_exposure_is_photographic(arrays):
-    info = json.loads(str(arrays["info"]))
+    """The stored frontal view has the luminance that `info` tells: the drawn one times a factor of the albedo."""
+    target = json.loads(str(arrays["info"]))["frontal_luminance"]
     low, high = SMALL.render.frontal_luminance
-    assert low <= info["frontal_luminance"] <= high
-    head = arrays["images"][0].astype(np.float32)[:24][arrays["masks"][0][:24] > 0]
-    assert 0.05 < head.mean() < 0.8
+    assert 0.4 * low <= target <= 1.5 * high
+    chin, _ = render.project(np.array([[0.0, -1.0, 0.8]]), arrays["K"][0], arrays["world_to_camera"][0])
+    rows = slice(0, int(chin[0, 1]))
+    luminance = arrays["images"][0].astype(np.float32)[rows] @ np.array(LUMINANCE)
+    assert luminance[arrays["masks"][0][rows] > 0].mean() == pytest.approx(target, rel=0.1)
 
 
 def test_scenes_repeat_bit_for_bit(arrays, hair_folder):

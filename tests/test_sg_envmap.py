@@ -23,6 +23,12 @@ LOBES = np.array(
 )
 
 
+@pytest.fixture(autouse=True)
+def scratch_folder(tmp_path_factory, monkeypatch):
+    """A failing chi-squared test writes its histogram into the working folder."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("chi2"))
+
+
 def emitter(lobes=LOBES, **extra):
     return mi.load_dict({"type": "sg_envmap", "lobes": mi.TensorXf(lobes), **extra})
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
@@ -137,9 +138,19 @@ def sky_map(random: np.random.Generator) -> tuple[np.ndarray, dict]:
 def read_map(path: Path) -> np.ndarray:
     """An HDRI [128, 256, 3], area-averaged to the working size; Poly Haven's maps fit the frame as they are."""
     try:
-        image = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+        with OpenEXR.File(str(path)) as file:
+            channels = file.channels()
+            image = np.stack([_channel(channels, name) for name in "RGB"], axis=-1).astype(np.float32)
     except Exception as error:
-        raise InputError(f"{path}: not a readable environment map ({error})") from None
-    if image.ndim != 3 or not np.isfinite(image).all():
+        raise InputError(f"{path}: not a readable RGB environment map ({error})") from None
+    if not image.size or not np.isfinite(image).all():
         raise InputError(f"{path}: not a finite RGB environment map")
     return cv2.resize(np.maximum(image, 0), (2 * MAP_HEIGHT, MAP_HEIGHT), interpolation=cv2.INTER_AREA).astype(float)
+
+
+def _channel(channels, name):
+    """One channel [H, W]; interleaved files group theirs under `RGB` or `RGBA`."""
+    for group in ("RGB", "RGBA"):
+        if group in channels:
+            return channels[group].pixels[..., "RGBA".index(name)]
+    return channels[name].pixels

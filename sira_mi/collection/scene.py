@@ -27,7 +27,8 @@ from sira_mi.collection.render import (
     render_views,
     sample_cameras,
 )
-from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.collection.skin import CLOTH
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
 
 LICENCE = "CC0-1.0 (MakeHuman base mesh, targets and hair; procedural appearance)"
 DIRECTIONS = 64
@@ -227,15 +228,13 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
 
     cameras = sample_cameras(random, settings.render.size)
     images, coverage = render_views(scene, *cameras, settings.render, seed)
-    target = random.uniform(*settings.render.frontal_luminance)
-    head_rows = _head_weight(coverage[0], cameras)
-    scale = exposure(images[0], head_rows, target)
-    images = images * scale
-    light_info["scale"] = scale
-
     wide = sample_parts(person.parts, 6 * settings.points, nose, random, settings)
     wide = wide.take(np.flatnonzero(seen_from_afar(scene, wide.points, wide.normals)))
     samples = choose_points(wide, nose, random, settings)
+    target = random.uniform(*settings.render.frontal_luminance) * metering(samples)
+    scale = exposure(images[0], _head_weight(coverage[0], cameras), target)
+    images = images * scale
+    light_info["scale"] = scale
     visible, colors = visible_colors(scene, samples, cameras, images, coverage)
 
     half = settings.volume // 2
@@ -271,6 +270,13 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
         "specular": samples.specular.astype(np.float16),
         "info": np.array(json.dumps(info)),
     }
+
+
+def metering(samples: Samples) -> float:
+    """Factor of a head's brightness in its photos: the square root of its albedo over a light skin's, half way between
+    a camera that evens out every head and one that exposes for the light."""
+    head = samples.region != CLOTH
+    return float(np.sqrt((samples.albedo[head] @ np.array(LUMINANCE)).mean() / 0.3))
 
 
 def _head_weight(coverage, cameras):

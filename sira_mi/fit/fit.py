@@ -5,23 +5,33 @@ import hashlib
 import json
 import resource
 import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import skimage.data
 
 import sira_mi
 from sira_mi.errors import InputError
 from sira_mi.files import write_exr, write_png, write_through
+from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
+from sira_mi.fit.rays import modelled_pixels
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, FitSettings
 from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
+from sira_mi.scene import orbited
+from sira_mi.sg.fit_environment import render_environment
+from sira_mi.sg.lights_io import write_lights
 
 # Files of an unfinished fit, inside the output folder.
 _WORK = ".fit"
+# A head of fewer foreground pixels cannot be fitted.
+_LEAST_PIXELS = 200
 
 
 @dataclass(frozen=True)
@@ -50,21 +60,10 @@ def fit_photo(request: FitRequest) -> int:
     settings = QUALITIES[request.quality]
     prior_path = request.prior or PRIOR
     prior = load_avatar(prior_path)
-    work = prepare_folder(request.out)
-    photo = write_example(work) if request.example else request.photo
-
-    from sira_mi.portrait.portrait import PortraitSettings, make_portrait
-
-    portrait = make_portrait(
-        photo,
-        PortraitSettings(working_size=settings.working_size),
-        prior.tensors["landmarks"],
-        mask_path=request.mask,
-        camera_path=request.camera,
-        face=request.face,
-    )
+    portrait = read_portrait(request, settings, prior)
     for note in portrait.notes:
         print(f"note: {note}", file=sys.stderr)
+    work = prepare_folder(request.out)
     seconds_portrait = time.monotonic() - started
 
     identity = identify(portrait, settings, request.seed, prior_path)
@@ -123,13 +122,25 @@ def prepare_folder(out: Path) -> Path:
     return work
 
 
-def write_example(work: Path) -> Path:
-    """The public-domain portrait inside scikit-image, as a PNG in the work folder."""
-    import skimage.data
-
-    path = work / "example.png"
-    write_png(path, skimage.data.astronaut() / 255)
-    return path
+def read_portrait(request: FitRequest, settings: FitSettings, prior: Avatar) -> Portrait:
+    """The portrait front end on the request's photo. Raises InputError when it cannot be used, and when the head would
+    not be in the picture of the camera given."""
+    with tempfile.TemporaryDirectory() as folder:
+        photo = request.photo
+        if request.example:
+            photo = Path(folder) / "astronaut.png"
+            write_png(photo, skimage.data.astronaut() / 255)
+        portrait = make_portrait(
+            photo,
+            PortraitSettings(working_size=settings.working_size),
+            prior.tensors["landmarks"],
+            mask_path=request.mask,
+            camera_path=request.camera,
+            face=request.face,
+        )
+    if (modelled_pixels(portrait.camera) & (portrait.mask > 0.5)).sum() < _LEAST_PIXELS:
+        raise InputError("the camera does not see the head inside the mask; check --camera and --mask")
+    return portrait
 
 
 def identify(portrait, settings: FitSettings, seed: int, prior_path: Path) -> str:
@@ -149,8 +160,7 @@ def initial_tensors(prior: Avatar, seed: int) -> dict[str, np.ndarray]:
     tensors = dict(prior.tensors)
     for name in ("z_sdf", "z_r", "z_a", "z_s"):
         tensors[name] = (tensors[name] + 0.01 * rng.standard_normal(tensors[name].shape)).astype(np.float32)
-    landmarks = tensors.pop("landmarks")
-    assert landmarks.shape == prior.tensors["landmarks"].shape
+    del tensors["landmarks"]
     return tensors
 
 
@@ -182,8 +192,6 @@ def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settin
 def finished_avatar(prior: Avatar, progress: Progress, settings: FitSettings) -> Avatar:
     """The avatar at the fit's last parameters, its light decoded to lobes; k_s and k_r are those of the stages that
     were reached."""
-    from dataclasses import replace
-
     from sira_mi.fit.appearance import decode_lobes
 
     tensors = {k: v for k, v in progress.tensors.items() if k in prior.tensors}
@@ -196,11 +204,6 @@ def finished_avatar(prior: Avatar, progress: Progress, settings: FitSettings) ->
 
 def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float) -> None:
     """Writes everything that a fit leaves behind."""
-    from sira_mi.fit import output
-    from sira_mi.scene import orbited
-    from sira_mi.sg.fit_environment import render_environment
-    from sira_mi.sg.lights_io import write_lights
-
     begun = time.monotonic()
     avatar_path = out / "avatar.safetensors"
     save_avatar(avatar_path, avatar)

@@ -28,7 +28,8 @@ def check_lobes(lobes: np.ndarray, source: str) -> np.ndarray:
     if not 1 <= len(lobes) <= MAXIMUM_LOBES:
         raise InputError(f"{source}: {len(lobes)} lobes; there must be 1 to {MAXIMUM_LOBES}")
     lobes = lobes.astype(np.float64)
-    single = lobes.astype(np.float32)
+    with np.errstate(over="ignore"):
+        single = lobes.astype(np.float32)
     length = np.linalg.norm(lobes[:, :3], axis=1)
     for fault, bad in (
         ("a value that is not finite", ~np.isfinite(single).all(axis=1)),

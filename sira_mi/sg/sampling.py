@@ -49,18 +49,28 @@ def _sum_lobes(direction, packed, density, count):
         cond=lambda index, radiance, pdf: index < count,
         body=body,
         labels=("index", "radiance", "pdf"),
+        mode="symbolic",
     )[1:]
 
 
-class _Mixture(dr.CustomOp):
-    """`_sum_lobes`, differentiated in reverse by a second loop over the lobes.
+class _EvaluateMixture(dr.CustomOp):
+    """`_sum_lobes` of a `LobeMixture`, differentiated in reverse by a second loop over the lobes.
 
     Dr.Jit cannot reverse a loop inside the virtual function calls through which integrators reach an emitter. The
-    second loop sends each lobe's derivative through its own gather, straight into the gradient of the lobes."""
+    second loop sends each lobe's derivative through its own gather, straight into the gradient of the lobes. The
+    argument `anchor`, a value gathered from the lobes, only makes the result depend on them."""
 
-    def eval(self, direction, anchor, packed, density, count):
-        self.direction, self.density, self.count = direction, density, count
-        return _sum_lobes(direction, dr.detach(packed), density, count)
+    def eval(self, direction, anchor, mixture):
+        self.direction, self.mixture = direction, mixture
+        return _sum_lobes(direction, dr.detach(mixture.lobes.array), mixture.density, mixture.count)
+
+    def forward(self):
+        with dr.resume_grad():
+            direction = mi.Vector3f(self.direction)
+            dr.enable_grad(direction)
+            dr.set_grad(direction, self.grad_in("direction"))
+            result = _sum_lobes(direction, self.mixture.lobes.array, self.mixture.density, self.mixture.count)
+            self.set_grad_out(dr.forward_to(result))
 
     def backward(self):
         gradient = self.grad_out()[0]
@@ -69,18 +79,22 @@ class _Mixture(dr.CustomOp):
             with dr.resume_grad():
                 direction = mi.Vector3f(self.direction)
                 dr.enable_grad(direction)
-                axis, sharpness, amplitude = unpack_lobe(self.packed, index)
+                axis, sharpness, amplitude = unpack_lobe(self.mixture.lobes.array, index)
                 radiance = evaluate_lobe(direction, axis, sharpness, amplitude)
-                dr.backward_from(dr.dot(radiance, gradient))
+                dr.backward_from(dr.dot(radiance, gradient), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
                 return index + 1, total + dr.grad(direction)
 
         _, total = dr.while_loop(
             state=(mi.UInt32(0), mi.Vector3f(0.0)),
-            cond=lambda index, total: index < self.count,
+            cond=lambda index, total: index < self.mixture.count,
             body=body,
             labels=("index", "d_direction"),
+            mode="symbolic",
         )
         self.set_grad_in("direction", total)
+
+    def name(self):
+        return "evaluate_mixture"
 
 
 class LobeMixture:
@@ -103,9 +117,8 @@ class LobeMixture:
 
     def evaluate(self, direction: "mi.Vector3f") -> tuple["mi.Color3f", "mi.Float"]:
         """Radiance `[..., 3]` and the density of `sample`, per steradian, in a unit direction."""
-        # The gather attaches the operation to the lobes wherever it is recorded; its value is not used.
         anchor = dr.gather(mi.Float, self.lobes.array, mi.UInt32(0))
-        return dr.custom(_Mixture, direction, anchor, self.lobes.array, self.density, self.count)
+        return dr.custom(_EvaluateMixture, direction, anchor, self)
 
     def sample(self, sample: "mi.Point2f", active: "mi.Bool" = True) -> "mi.Vector3f":
         """A direction: a lobe by its share of the energy, then a direction in it."""

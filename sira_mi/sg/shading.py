@@ -107,7 +107,7 @@ def _point_gradient(point, packed, count, gradient):
         inputs = tuple(type(value)(value) for value in point)
         dr.enable_grad(inputs)
         parts = _integrate_lobe(SpecularLobes(*inputs), *unpack_lobe(packed, index))
-        dr.backward(_weigh(parts, gradient))
+        dr.backward(_weigh(parts, gradient), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return index + 1, *(total + dr.grad(value) for total, value in zip(sums, inputs, strict=True))
 
     return dr.while_loop(
@@ -139,7 +139,8 @@ def _lobe_gradient(point, packed, count, gradient):
         axis, sharpness, amplitude = inputs = unpack_raw(packed, lobe)
         dr.enable_grad(inputs)
         parts = _integrate_lobe(here, dr.normalize(axis), sharpness, amplitude)
-        dr.backward(dr.select(active, _weigh(parts, weights), 0.0))
+        loss = dr.select(active, _weigh(parts, weights), 0.0)
+        dr.backward(loss, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return step + 1, *(total + dr.grad(value) for total, value in zip(sums, inputs, strict=True))
 
     _, axis, sharpness, amplitude = dr.while_loop(

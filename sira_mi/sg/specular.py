@@ -1,11 +1,11 @@
 """The specular reflectance at a shading point as lobes of light directions, and its integral against a light lobe.
 
 PhySG warps the normal distribution around the mirror direction and takes Fresnel and masking there; for rough surfaces
-seen at an angle the true integrand lies elsewhere and is wider. Here a lobe times the light's cosine has the exact
-integral over the hemisphere and the exact mean direction of reflectance times cosine, from a table by view cosine and
-roughness. One lobe is too round for a light sharper than itself; the reflectance relative to the lobe, at the centre
-of the product with the light, corrects it in proportion to w = (λ_light / (λ_light + λ_lobe))². Broad lights keep the
-exact energy, and for sharp ones the result tends to reflectance × irradiance.
+seen at an angle the true integrand lies elsewhere and is wider. Here a lobe times the light's cosine has the integral
+over the hemisphere (within about 1%) and the mean direction of reflectance times cosine, from a table by view cosine
+and roughness. One lobe is too round for a light sharper than itself; the reflectance relative to the lobe, at the
+centre of the product with the light, corrects it in proportion to w = (λ_light / (λ_light + λ_lobe))². Broad lights
+keep their energy, and for sharp ones the result tends to reflectance × irradiance.
 """
 
 import math

@@ -1,0 +1,118 @@
+"""A small smooth head for the tests of fields, plugins and models, and the comparison of gradients with differences."""
+
+import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
+
+# isort: split
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from sira_mi.fields.appearance import fibonacci_directions
+from sira_mi.fields.mlp import Architecture, initial_parameters
+from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
+
+mi.set_variant("llvm_ad_rgb")
+
+SMALL = AvatarArchitecture(
+    features=4,
+    sdf_octaves=2,
+    sdf_width=32,
+    sdf_depth=3,
+    sdf_latent=6,
+    rendering_octaves=2,
+    rendering_width=16,
+    rendering_depth=2,
+    rendering_latent=4,
+    albedo_octaves=2,
+    albedo_width=16,
+    albedo_depth=2,
+    albedo_latent=4,
+    specular_octaves=1,
+    specular_width=16,
+    specular_depth=2,
+    specular_latent=3,
+    refinement_octaves=3,
+    refinement_width=16,
+    refinement_depth=2,
+    lobes=8,
+    illumination_width=16,
+    illumination_depth=2,
+    illumination_latent=4,
+)
+
+
+def smooth_sphere(architecture: Architecture, rng: np.random.Generator, radius: float) -> np.ndarray:
+    """Flat parameters of a smooth field close to |x| − radius: even directions far within the bend of the softplus,
+    then layers close to the identity. (The geometric initialisation is a coarse sphere when its layers are narrow.)"""
+    first, lift = 0.04, 0.1
+    parts = []
+    for k, (weight, bias, latent) in enumerate(architecture.shapes()):
+        matrix, offset = np.zeros(weight), np.zeros(bias)
+        if k == 0:
+            matrix[:, :3] = first * fibonacci_directions(weight[0])
+        elif k < architecture.depth:
+            matrix = np.eye(weight[0]) + 0.02 * rng.standard_normal(weight)
+            offset += lift if k == 1 else 0
+        else:
+            matrix += 1 / weight[1]
+        parts.append((matrix, offset, np.zeros(latent)))
+
+    def average(r):
+        h = np.zeros((architecture.inputs, 1))
+        h[:3, 0] = r * np.array([0.3, 0.5, np.sqrt(1 - 0.34)])
+        for k, (matrix, offset, _) in enumerate(parts):
+            h = matrix @ h + offset
+            h = np.logaddexp(0, 100 * h) / 100 if k < architecture.depth else h
+        return h.item()
+
+    slope = (average(1.05 * radius) - average(0.95 * radius)) / (0.1 * radius)
+    matrix, offset, latent = parts[-1]
+    parts[-1] = (matrix / slope, offset - average(radius) / slope, latent)
+    return np.concatenate([piece.ravel() for part in parts for piece in part])
+
+
+def small_avatar(seed: int = 1) -> Avatar:
+    """A smooth blob of about 1.4 units' radius: a sphere as reference, slightly deformed, under eight lobes."""
+    rng = np.random.default_rng(seed)
+    networks = SMALL.networks
+    deformation = initial_parameters(networks["deformation"], rng, output_scale=0.3)
+    deformation[: SMALL.sdf_width * networks["deformation"].inputs] *= 0.1
+    tensors = {
+        "deformation": deformation,
+        "reference": smooth_sphere(networks["reference"], rng, 1.4),
+        "rendering": initial_parameters(networks["rendering"], rng, output_scale=0.3),
+        "diffuse_albedo": initial_parameters(networks["diffuse_albedo"], rng),
+        "specular_albedo": initial_parameters(networks["specular_albedo"], rng),
+        "albedo_refinement": initial_parameters(networks["albedo_refinement"], rng, output_scale=0.3),
+        "illumination": initial_parameters(networks["illumination"], rng, output_scale=0.1),
+        **{name: 0.3 * rng.standard_normal(size) for name, size in SMALL.latents.items()},
+        "landmarks": np.full((LANDMARKS, 3), np.nan),
+    }
+    sharpness = rng.uniform(2, 20, (SMALL.lobes, 1))
+    amplitude = rng.uniform(0.2, 1.0, (SMALL.lobes, 3))
+    tensors["lobes"] = np.concatenate([fibonacci_directions(SMALL.lobes), sharpness, amplitude], axis=1)
+    return Avatar(SMALL, {name: value.astype(np.float32) for name, value in tensors.items()})
+
+
+@pytest.fixture(scope="session")
+def avatar() -> Avatar:
+    return small_avatar()
+
+
+@pytest.fixture(scope="session")
+def avatar_path(avatar, tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("avatar") / "avatar.safetensors"
+    save_avatar(path, avatar)
+    return str(path)
+
+
+def slopes(loss, value: np.ndarray, gradient: np.ndarray, step: float, seed: int = 0) -> tuple[float, float]:
+    """(AD, central difference) of `loss` along a direction that weighs the entries of `gradient` at random and has a
+    random part; `step` is the change of the whole vector, in its own units."""
+    rng = np.random.default_rng(seed)
+    weighted = gradient * rng.uniform(0, 2, gradient.shape)
+    noise = rng.standard_normal(gradient.shape)
+    direction = weighted / np.linalg.norm(weighted) + 0.5 * noise / np.linalg.norm(noise)
+    direction /= np.linalg.norm(direction)
+    ahead, behind = (loss((value + sign * step * direction).astype(np.float32)) for sign in (1, -1))
+    return float((gradient * direction).sum()), (ahead - behind) / (2 * step)

@@ -1,0 +1,436 @@
+"""Networks in both modes, derivatives of the field, extraction and tracing: against differences and slow references."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from conftest import SMALL, slopes
+
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.fields import appearance, extraction, mlp, sdf, tracing
+from sira_mi.fields.encoding import encode, encode_cooperative, encode_with_tangents, encoded_size
+
+RADIUS = 1.2
+
+
+def head_field(avatar, dtype=mi.Float, **replaced) -> sdf.SdfField:
+    tensors = {**avatar.tensors, **replaced}
+    networks = avatar.architecture.networks
+    latent = mi.TensorXf(dtype(tensors["z_sdf"]), (len(tensors["z_sdf"]), 1))
+    return sdf.SdfField(
+        mlp.layers(networks["deformation"], mi.Float(tensors["deformation"]), latent),
+        mlp.layers(networks["reference"], mi.Float(tensors["reference"])),
+        avatar.architecture.sdf_octaves,
+    )
+
+
+def points_near_surface(count: int, seed: int = 3) -> np.ndarray:
+    """[3, count] float32 points of a shell about the head's surface."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((3, count))
+    return (x / np.linalg.norm(x, axis=0) * rng.uniform(0.9, 1.9, count)).astype(np.float32)
+
+
+def in_double(architecture, parameters: np.ndarray, latent: np.ndarray | None, h: np.ndarray) -> np.ndarray:
+    """The network in NumPy and float64, written from its definition."""
+    offset = 0
+    for k, (weight, bias, shift) in enumerate(architecture.shapes()):
+        sizes = [a * b for a, b in (weight, bias, shift)]
+        w, b, z = np.split(parameters[offset : offset + sum(sizes)].astype(np.float64), np.cumsum(sizes)[:2])
+        offset += sum(sizes)
+        h = w.reshape(weight) @ h + b[:, None]
+        if shift[1] and latent is not None:
+            h = h + z.reshape(shift) @ latent.astype(np.float64)[:, None]
+        if k < architecture.depth:
+            h = np.logaddexp(0, 100 * h) / 100
+    assert offset == len(parameters)
+    return h
+
+
+def encoded_in_double(x: np.ndarray, octaves: int) -> np.ndarray:
+    phases = [2.0**k * c for k in range(octaves) for c in x]
+    return np.stack([*x, *np.sin(phases), *np.cos(phases)]) if octaves else x
+
+
+def field_in_double(avatar, x: np.ndarray) -> np.ndarray:
+    """Signed distances [N] in float64."""
+    networks, t, octaves = avatar.architecture.networks, avatar.tensors, avatar.architecture.sdf_octaves
+    delta = in_double(networks["deformation"], t["deformation"], t["z_sdf"], encoded_in_double(x, octaves))[:3]
+    return in_double(networks["reference"], t["reference"], None, encoded_in_double(x + delta, octaves))[0]
+
+
+# Networks
+
+
+def test_flat_parameters_are_all_used_and_counted():
+    architecture = mlp.Architecture(inputs=15, outputs=4, width=8, depth=2, latent=3)
+    assert architecture.parameters == (15 * 8 + 8 + 3 * 8) + (8 * 8 + 8 + 3 * 8) + (8 * 4 + 4)
+    for parameters in (
+        mlp.initial_parameters(architecture, np.random.default_rng(0)),
+        sdf.sphere_parameters(architecture, np.random.default_rng(0), 1.0),
+    ):
+        assert parameters.shape == (architecture.parameters,) and parameters.dtype == np.float32
+    flat = mi.Float(np.arange(architecture.parameters, dtype=np.float32))
+    layers = mlp.layers(architecture, flat)
+    assert [(w.shape, b.shape) for w, b in layers] == [((8, 15), (8, 1)), ((8, 8), (8, 1)), ((4, 8), (4, 1))]
+    assert layers[1][0].numpy()[0, 0] == 15 * 8 + 8 + 3 * 8
+
+
+def test_sizes_that_no_network_has_are_refused():
+    for sizes in ((0, 1, 8, 2), (3, 1, 8, 0), (3, 1, 4096, 40), (3, 1, 8, 2, -1)):
+        with pytest.raises(ValueError, match="unusable"):
+            mlp.Architecture(*sizes)
+
+
+def test_geometric_initialisation_is_a_coarse_sphere():
+    architecture = mlp.Architecture(encoded_size(6), 1, 256, 4)
+    parameters = sdf.sphere_parameters(architecture, np.random.default_rng(5), 1.4)
+    x = points_near_surface(300)
+    x /= np.linalg.norm(x, axis=0)
+    f = [in_double(architecture, parameters, None, encoded_in_double(r * x, 6))[0] for r in (0.3, 1.4, 2.6)]
+    assert f[0].max() < 0 < f[2].min()
+    assert abs(f[1].mean()) < 0.4
+
+
+@pytest.mark.parametrize("name", ["deformation", "diffuse_albedo", "albedo_refinement"])
+def test_both_modes_and_float64_agree_in_value_and_gradient(avatar, name):
+    """Every decoder that exists in both modes is a composition of these and of the encoding, tested below."""
+    architecture = SMALL.networks[name]
+    latent = next((avatar.tensors[z] for z, n in (("z_sdf", "deformation"), ("z_a", "diffuse_albedo")) if n == name), None)
+    h = np.random.default_rng(1).uniform(-1, 1, (architecture.inputs, 500)).astype(np.float32)
+    weight = mi.TensorXf(np.random.default_rng(2).standard_normal((architecture.outputs, 500)).astype(np.float32))
+
+    def run(cooperative: bool):
+        parameters = mi.Float(avatar.tensors[name])
+        z = None if latent is None else mi.TensorXf(latent[:, None])
+        dr.enable_grad(parameters)
+        if z is not None:
+            dr.enable_grad(z)
+        network = mlp.layers(architecture, parameters, z)
+        if cooperative:
+            outputs = mlp.evaluate_cooperative(mlp.pack(network), [mi.Float(row) for row in h])
+            outputs = dr.concat([mi.TensorXf(mi.Float(o), (1, 500)) for o in outputs], axis=0)
+        else:
+            outputs = mlp.evaluate(network, mi.TensorXf(h))
+        dr.backward(dr.sum(outputs * weight, axis=None))
+        return outputs.numpy(), dr.grad(parameters).numpy(), dr.grad(z).numpy() if z is not None else np.zeros(1)
+
+    tensor, symbolic = run(False), run(True)
+    exact = in_double(architecture, avatar.tensors[name], latent, h.astype(np.float64))
+    for mine, other in zip(tensor, symbolic, strict=True):
+        assert np.abs(mine - other).max() < 1e-5 * max(1, np.abs(mine).max())
+    assert np.abs(tensor[0] - exact).max() < 1e-5 * max(1, np.abs(exact).max())
+    assert np.abs(tensor[1]).max() > 0
+
+
+def test_appearance_decoders_agree_in_both_modes(avatar):
+    networks, t = SMALL.networks, avatar.tensors
+    x = points_near_surface(400)
+
+    def layers(name, latent=None):
+        z = None if latent is None else mi.TensorXf(t[latent][:, None])
+        return mlp.layers(networks[name], mi.Float(t[name]), z)
+
+    field = head_field(avatar)
+    x_ref, gamma = sdf.deform(field, mi.TensorXf(x))
+    point, features = appearance.deform_cooperative(mlp.pack(field.deformation), SMALL.sdf_octaves, [mi.Float(c) for c in x])
+    a, s, r = layers("diffuse_albedo", "z_a"), layers("specular_albedo", "z_s"), layers("albedo_refinement")
+    pairs = [
+        (x_ref, point),
+        (gamma, features),
+        (
+            appearance.diffuse_albedo(a, 2, x_ref, gamma),
+            appearance.diffuse_albedo_cooperative(mlp.pack(a), 2, point, features),
+        ),
+        (appearance.specular_albedo(s, 1, x_ref), appearance.specular_albedo_cooperative(mlp.pack(s), 1, point)),
+        (
+            appearance.albedo_refinement(r, 3, x_ref, gamma),
+            appearance.albedo_refinement_cooperative(mlp.pack(r), 3, point, features),
+        ),
+    ]
+    for tensor, rows in pairs:
+        assert np.abs(tensor.numpy() - np.stack([row.numpy() for row in rows])).max() < 1e-5
+
+
+def test_illumination_decoder_gives_unit_axes_and_bounded_lobes(avatar):
+    """Even far from where it was trained."""
+    network = mlp.layers(SMALL.networks["illumination"], mi.Float(avatar.tensors["illumination"] * 30))
+    z = np.random.default_rng(0).standard_normal((SMALL.illumination_latent, 5)).astype(np.float32) * 20
+    lobes = appearance.illumination(network, mi.TensorXf(z)).numpy()
+    assert lobes.shape == (SMALL.lobes, 7, 5) and np.isfinite(lobes).all()
+    assert np.abs(np.linalg.norm(lobes[:, :3], axis=1) - 1).max() < 1e-3
+    for rows, (low, high) in ((lobes[:, 3], appearance.LOG_SHARPNESS), (lobes[:, 4:], appearance.LOG_AMPLITUDE)):
+        assert np.exp(low) * 0.999 <= rows.min() and rows.max() <= np.exp(high) * 1.001
+    single = appearance.illumination(network, mi.TensorXf(z[:, 2:3].copy())).numpy()
+    np.testing.assert_allclose(lobes[:, :, 2], single[:, :, 0], rtol=1e-4)
+
+
+def test_refined_albedo_is_equation_11_within_its_range():
+    base, fine = mi.TensorXf([[0.2, 0.9, 0.1]]), mi.TensorXf([[0.5, 0.5, -0.5]])
+    np.testing.assert_allclose(appearance.refined_albedo(base, fine, 0.4).numpy(), [[0.4, 1.0, 0.0]], atol=1e-6)
+
+
+def test_several_latents_at_once_equal_single_evaluations(avatar):
+    architecture = SMALL.networks["deformation"]
+    rng = np.random.default_rng(4)
+    latents = rng.standard_normal((SMALL.sdf_latent, 3)).astype(np.float32)
+    h = rng.uniform(-1, 1, (architecture.inputs, 3 * 40)).astype(np.float32)
+    parameters = mi.Float(avatar.tensors["deformation"])
+    z = mi.TensorXf(latents)
+    dr.enable_grad(parameters, z)
+    together = mlp.evaluate(mlp.layers(architecture, parameters, z), mi.TensorXf(h))
+    dr.backward(dr.sum(together * together, axis=None))
+    gradient = dr.grad(parameters).numpy()
+    summed = np.zeros_like(gradient)
+    for k in range(3):
+        mine = slice(40 * k, 40 * (k + 1))
+        dr.disable_grad(parameters)
+        dr.enable_grad(parameters)
+        column = mi.TensorXf(latents[:, k : k + 1].copy())
+        dr.enable_grad(column)
+        alone = mlp.evaluate(mlp.layers(architecture, parameters, column), mi.TensorXf(h[:, mine].copy()))
+        dr.backward(dr.sum(alone * alone, axis=None))
+        np.testing.assert_allclose(together.numpy()[:, mine], alone.numpy(), atol=1e-5)
+        np.testing.assert_allclose(dr.grad(z).numpy()[:, k], dr.grad(column).numpy()[:, 0], rtol=1e-3, atol=1e-4)
+        summed += dr.grad(parameters).numpy()
+    assert np.abs(gradient - summed).max() < 1e-5 * np.abs(summed).max()
+
+
+def test_gradients_repeat_bit_for_bit(avatar):
+    """With latents, tangents and many points; atomic additions would differ from run to run."""
+    x = mi.TensorXf(points_near_surface(20000))
+
+    def gradient():
+        values = [mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")]
+        dr.enable_grad(*values)
+        networks = SMALL.networks
+        latent = mi.TensorXf(values[2], (SMALL.sdf_latent, 1))
+        field = sdf.SdfField(
+            mlp.layers(networks["deformation"], values[0], latent), mlp.layers(networks["reference"], values[1]), 2
+        )
+        f, slope, x_ref, gamma = sdf.surface(field, x)
+        total = f * f + dr.sum(slope * x_ref, axis=0) + dr.sum(gamma * gamma, axis=0)
+        dr.backward(dr.mean(total, axis=None))
+        return [dr.grad(v).numpy() for v in values]
+
+    first = gradient()
+    for _ in range(4):
+        assert all((a == b).all() for a, b in zip(first, gradient(), strict=True))
+
+
+# Derivatives
+
+
+@pytest.mark.parametrize("octaves", [0, 3])
+def test_encoding_and_its_tangents(octaves):
+    x = points_near_surface(50)
+    tangent = np.random.default_rng(1).standard_normal(x.shape).astype(np.float32)
+    features, (slope,) = encode_with_tangents(mi.TensorXf(x), [mi.TensorXf(tangent)], octaves)
+    assert features.shape[0] == encoded_size(octaves)
+    h = 1e-6
+    forward, back = (encoded_in_double(x.astype(np.float64) + s * h * tangent, octaves) for s in (1, -1))
+    np.testing.assert_allclose(features.numpy(), encoded_in_double(x.astype(np.float64), octaves), atol=2e-6)
+    np.testing.assert_allclose(slope.numpy(), (forward - back) / (2 * h), atol=1e-4)
+    np.testing.assert_array_equal(encode(mi.TensorXf(x), octaves).numpy(), features.numpy())
+    rows = encode_cooperative([mi.Float(c) for c in x], octaves)
+    np.testing.assert_allclose(np.stack([r.numpy() for r in rows]), features.numpy(), atol=2e-6)
+
+
+def test_gradient_of_the_field_equals_differences_in_float64(avatar):
+    x = points_near_surface(300)
+    f, gradient, x_ref, gamma = (a.numpy() for a in sdf.surface(head_field(avatar), mi.TensorXf(x)))
+    exact, h = x.astype(np.float64), 1e-5
+    np.testing.assert_allclose(f[0], field_in_double(avatar, exact), atol=1e-5)
+    steps = h * np.eye(3)[:, :, None]
+    difference = [(field_in_double(avatar, exact + s) - field_in_double(avatar, exact - s)) / (2 * h) for s in steps]
+    np.testing.assert_allclose(gradient, difference, atol=1e-4)
+    direction = np.random.default_rng(0).standard_normal(x.shape).astype(np.float32)
+    value, slope = sdf.signed_distance_and_slope(head_field(avatar), mi.TensorXf(x), mi.TensorXf(direction))
+    np.testing.assert_allclose(slope.numpy()[0], (gradient * direction).sum(axis=0), atol=1e-5)
+    np.testing.assert_allclose(value.numpy(), f, atol=1e-6)
+    again = sdf.deform(head_field(avatar), mi.TensorXf(x))
+    np.testing.assert_allclose(again[0].numpy(), x_ref, atol=1e-6)
+    np.testing.assert_allclose(again[1].numpy(), gamma, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["deformation", "reference", "z_sdf"])
+def test_derivative_of_the_eikonal_loss_equals_differences(avatar, name):
+    """The gradient of the field is primal code, so AD of a loss on it is first order."""
+    x = mi.TensorXf(points_near_surface(400))
+
+    def loss(value, attached=False):
+        values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")} | {name: mi.Float(value)}
+        if attached:
+            dr.enable_grad(values[name])
+        networks = SMALL.networks
+        latent = mi.TensorXf(values["z_sdf"], (SMALL.sdf_latent, 1))
+        field = sdf.SdfField(
+            mlp.layers(networks["deformation"], values["deformation"], latent),
+            mlp.layers(networks["reference"], values["reference"]),
+            2,
+        )
+        gradient = sdf.surface(field, x)[1]
+        deviation = dr.sum(gradient * gradient, axis=0) - 1
+        result = dr.mean(deviation * deviation, axis=None)
+        if not attached:
+            return float(result.numpy().item())
+        dr.backward(result)
+        return dr.grad(values[name]).numpy()
+
+    start = avatar.tensors[name]
+    ad, difference = slopes(loss, start, loss(start, attached=True), 2e-3 if name == "reference" else 5e-3)
+    assert ad == pytest.approx(difference, rel=1e-3)
+
+
+# Extraction
+
+
+def sphere(points: np.ndarray) -> np.ndarray:
+    return (np.linalg.norm(points, axis=0) - RADIUS).astype(np.float32)
+
+
+def watertight(surface) -> trimesh.Trimesh:
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    return mesh
+
+
+def test_extracted_sphere_has_the_volume_and_area_of_a_sphere():
+    mesh = watertight(extraction.extract(sphere, 0.05))
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=2e-3)
+    assert mesh.area == pytest.approx(4 * np.pi * RADIUS**2, rel=2e-3)
+    outward = (mesh.face_normals * mesh.triangles_center).sum(axis=1)
+    assert outward.min() > 0
+
+
+def test_coarse_to_fine_extraction_equals_the_dense_one(avatar):
+    field = head_field(avatar)
+    evaluate = lambda x: sdf.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
+    for function, voxel in ((evaluate, 0.1), (sphere, 0.07)):
+        fast, slow = extraction.extract(function, voxel), extraction.extract_reference(function, voxel)
+        np.testing.assert_array_equal(fast.faces, slow.faces)
+        np.testing.assert_allclose(fast.vertices, slow.vertices, atol=1e-5)
+        assert fast.grid.shape == slow.grid.shape and fast.spacing == pytest.approx(slow.spacing)
+        watertight(fast)
+
+
+def test_a_solid_that_leaves_the_box_is_closed_along_it():
+    """Half a space below y = 0.5: a box with its lid on the field's surface."""
+    surface = extraction.extract(lambda x: x[1] - 0.5, 0.1)
+    mesh = watertight(surface)
+    lower, upper = mesh.bounds
+    assert lower == pytest.approx(DOMAIN_LOWER, abs=1e-3)
+    assert upper[1] == pytest.approx(0.5, abs=1e-5)
+    assert (upper <= np.array(DOMAIN_UPPER) + 0.81).all() and upper[0] >= DOMAIN_UPPER[0] - 1e-3
+    on_lid = np.abs(surface.vertices[:, 1] - 0.5) < 1e-5
+    inside = np.abs(surface.vertices[:, 0]) < 2.4
+    assert not surface.on_box[on_lid & inside & (np.abs(surface.vertices[:, 2]) < 1.8)].any()
+    assert surface.on_box[surface.vertices[:, 1] < 0.4].all()
+
+
+@pytest.mark.parametrize("value", [1.0, -1.0])
+def test_a_field_without_a_surface_is_named_so(value):
+    if value < 0:
+        mesh = watertight(extraction.extract(lambda x: np.full(x.shape[1], value, np.float32), 0.2))
+        assert mesh.volume > 0  # solid everywhere: the box itself
+    else:
+        with pytest.raises(extraction.EmptySurfaceError):
+            extraction.extract(lambda x: np.full(x.shape[1], value, np.float32), 0.2)
+
+
+# Tracing
+
+
+def rays_at_head(count: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions [3, count] of rays that all meet the head, none of them grazing."""
+    rng = np.random.default_rng(seed)
+    origin = rng.standard_normal((3, count))
+    origin *= 4 / np.linalg.norm(origin, axis=0)
+    direction = rng.uniform(-0.4, 0.4, (3, count)) - origin
+    return origin.astype(np.float32), (direction / np.linalg.norm(direction, axis=0)).astype(np.float32)
+
+
+def exact_hits(field, origin, direction):
+    outside, inside = mi.TensorXf(np.full((1, origin.shape[1]), 1.8, np.float32)), mi.TensorXf(
+        np.full((1, origin.shape[1]), 4.0, np.float32)
+    )
+    return tracing.bisection_hits_reference(field, mi.TensorXf(origin), mi.TensorXf(direction), outside, inside)
+
+
+@pytest.mark.parametrize("offset", [0.02, -0.02])
+def test_newton_steps_reach_the_bisected_hit_from_two_millimetres_off(avatar, offset):
+    field = head_field(avatar)
+    origin, direction = rays_at_head(500)
+    exact = exact_hits(field, origin, direction).numpy()
+    t, f = tracing.newton_hits(field, mi.TensorXf(origin), mi.TensorXf(direction), mi.TensorXf(exact + np.float32(offset)))
+    assert np.abs(t.numpy() - exact).max() < 1e-4
+    assert np.abs(f.numpy()).max() < tracing.HIT_TOLERANCE
+
+
+def test_a_ray_that_misses_is_not_a_hit(avatar):
+    origin, direction = np.array([[3.0], [0], [5]], np.float32), np.array([[0.0], [0], [-1]], np.float32)
+    _, f = tracing.newton_hits(head_field(avatar), *(mi.TensorXf(a) for a in (origin, direction, [[5.0]])))
+    assert abs(f.numpy().item()) > tracing.HIT_TOLERANCE
+
+
+@pytest.mark.parametrize("name", ["deformation", "reference", "z_sdf"])
+def test_differentiable_hit_moves_as_the_traced_hit_does(avatar, name):
+    origin, direction = rays_at_head(200)
+    start = avatar.tensors[name]
+    weight = np.random.default_rng(1).standard_normal(200)
+
+    def loss(value):
+        hits = exact_hits(head_field(avatar, **{name: value}), origin, direction).numpy()[0]
+        return float((hits * weight).mean())
+
+    values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")}
+    dr.enable_grad(values[name])
+    networks = SMALL.networks
+    latent = mi.TensorXf(values["z_sdf"], (SMALL.sdf_latent, 1))
+    field = sdf.SdfField(
+        mlp.layers(networks["deformation"], values["deformation"], latent),
+        mlp.layers(networks["reference"], values["reference"]),
+        2,
+    )
+    o, d = mi.TensorXf(origin), mi.TensorXf(direction)
+    with dr.suspend_grad():
+        t = exact_hits(field, origin, direction)
+        _, slope = sdf.signed_distance_and_slope(field, o + t * d, d)
+    x = tracing.differentiable_hit(field, o, d, t, slope)
+    np.testing.assert_allclose(x.numpy(), origin + t.numpy() * direction, atol=1e-6)
+    along = dr.sum((x - o) * d, axis=0)
+    dr.backward(dr.mean(along * mi.TensorXf(weight.astype(np.float32)), axis=None))
+    ad, difference = slopes(loss, start, dr.grad(values[name]).numpy(), 5e-3)
+    assert ad == pytest.approx(difference, rel=1e-3)
+
+
+def test_closest_approach_finds_the_smallest_distance_along_a_ray(avatar):
+    field = head_field(avatar)
+    evaluate = lambda x: sdf.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
+    surface = extraction.extract(evaluate, 0.05)
+    grid = tracing.DistanceGrid.of(surface.grid, surface.spacing)
+    origin, direction = rays_at_head(200)
+    side = np.cross(direction.T, [0.3, 0.9, 0.1]).T
+    side /= np.linalg.norm(side, axis=0)
+    origin = (origin + side * np.linspace(1.0, 1.7, 200)).astype(np.float32)  # grazing, through, and past the head
+    near, far = mi.Float(2.2), mi.Float(5.5)
+    t = tracing.closest_approach(grid, mi.Point3f(origin), mi.Vector3f(direction), near, far, mi.Bool(True)).numpy()
+    found = evaluate(origin + t * direction)
+    dense = np.linspace(2.2, 5.5, 400, dtype=np.float32)
+    along = (origin[:, :, None] + dense * direction[:, :, None]).reshape(3, -1)
+    best = evaluate(along).reshape(200, 400).min(axis=1)
+    relevant = np.abs(best) < 0.1  # where the mask is decided; away from the surface the grid only interpolates
+    assert relevant.sum() > 30
+    assert (found - best)[relevant].max() < 1e-3
+    assert (found - best).max() < 0.05
+
+
+def test_distance_grid_is_exact_on_a_linear_field_and_constant_outside():
+    axes = [lower + 0.5 * np.arange(n) for lower, n in zip(DOMAIN_LOWER, (5, 6, 7), strict=True)]
+    plane = lambda x, y, z: 0.3 * x - 0.7 * y + 0.2 * z + 0.1  # noqa: E731
+    grid = tracing.DistanceGrid.of(plane(*np.meshgrid(*axes, indexing="ij")), 0.5)
+    low, high = np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
+    p = np.random.default_rng(0).uniform(low - 0.5, high + 0.5, (100, 3)).T
+    values = grid(mi.Point3f(p.astype(np.float32)), mi.Bool(True)).numpy()
+    np.testing.assert_allclose(values, plane(*np.clip(p.T, low, high).T), atol=1e-5)

@@ -1,0 +1,251 @@
+"""The fit as a user runs it: what it leaves behind, resume to the same result, interrupts, bad input."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import skimage.data
+import trimesh
+from PIL import Image
+
+from sira_mi.errors import InputError
+from sira_mi.fit import settings as fit_settings
+from sira_mi.fit.driver import Progress, load_progress, save_progress
+from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_camera, window_pixels
+from sira_mi.models.avatar import PRIOR, load_avatar
+from sira_mi.portrait.camera import Camera
+
+# A fit of a few steps a stage: every stage and every file is real, only too short to look good.
+TINY = fit_settings.FitSettings(
+    quality="tiny",
+    working_size=128,
+    rays=256,
+    points=64,
+    pixels=256,
+    voxel=0.16,
+    final_voxel=0.12,
+    stages=tuple(
+        (kind, dataclasses.replace(stage, steps=6)) for kind, stage in fit_settings.QUALITIES["draft"].stages
+    ),
+    block=3,
+)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    """`fit_photo` with the tiny settings as its draft quality."""
+    from sira_mi.fit.fit import FitRequest, fit_photo
+
+    def run(out, **options):
+        patch = pytest.MonkeyPatch()
+        patch.setitem(fit_settings.QUALITIES, "draft", TINY)
+        try:
+            return fit_photo(FitRequest(photo=options.pop("photo", None), out=out, quality="draft", **options))
+        finally:
+            patch.undo()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def finished(fit, tmp_path_factory):
+    """The folder of a finished tiny fit of the example."""
+    out = tmp_path_factory.mktemp("fit") / "avatar with späce"
+    assert fit(out, example=True) == 0
+    return out
+
+
+def test_output_folder_is_complete_and_consistent(finished):
+    """Every file that the README promises is there, at the photo's working resolution, and opens."""
+    report = json.loads((finished / "avatar.json").read_text())
+    assert report["complete"] and report["psnr_inside_mask_db"] > 8
+    assert set(report["losses"]) == {stage.name for _, stage in TINY.stages}
+    assert set(report["seconds"]) >= {"portrait", "latents", "refinement", "output", "total"}
+    size = (128, 128)
+    assert Image.open(finished / "input.png").size == size
+    names = ("final", "diffuse", "specular", "diffuse_albedo", "specular_albedo", "normal", "depth")
+    for name in names:
+        assert Image.open(finished / "renders" / f"{name}.png").size == size
+        assert mi.Bitmap(str(finished / "renders" / f"{name}.exr")).size() == mi.ScalarVector2u(*size)
+    mask = np.asarray(Image.open(finished / "renders" / "mask.png"))
+    assert 0.05 < (mask > 127).mean() < 0.9
+    assert Image.open(finished / "contact.png").size[0] > 1000
+    mesh = trimesh.load(finished / "mesh.ply", process=False)
+    assert mesh.is_watertight and 0.2 < np.ptp(mesh.vertices[:, 1]) < 0.6
+    assert not (finished / ".fit").exists()
+    avatar = load_avatar(finished / "avatar.safetensors")
+    stored = json.loads((finished / "lights.json").read_text())["lobes"]
+    assert np.allclose([lobe["amplitude"] for lobe in stored], avatar.tensors["lobes"][:, 4:7], rtol=1e-5)
+    assert avatar.k_s == 1 and avatar.k_r == 1
+
+
+def test_scene_file_shows_the_same_picture(finished):
+    """`mi.load_file("scene.xml")` renders what `renders/final.exr` holds, in the photo's camera."""
+    scene = mi.load_file(str(finished / "scene.xml"), voxel=0.12)
+    image = mi.render(scene, spp=8).numpy()
+    final = np.array(mi.Bitmap(str(finished / "renders" / "final.exr")))
+    mask = np.asarray(Image.open(finished / "renders" / "mask.png")) == 255
+    assert mask.any()
+    assert np.median(np.abs(image[..., :3] - final)[mask]) < 0.01
+
+
+def test_only_what_each_stage_names_is_moved(finished):
+    """The reference SDF is never optimised (section 3.2.1), nor is the base albedo network (section 3.2.2)."""
+    prior, avatar = load_avatar(), load_avatar(finished / "avatar.safetensors")
+    for name in ("reference", "diffuse_albedo", "specular_albedo"):
+        assert np.array_equal(prior.tensors[name], avatar.tensors[name])
+    for name in ("deformation", "rendering", "albedo_refinement", "z_sdf", "z_r", "z_a", "z_s", "z_l"):
+        assert not np.array_equal(prior.tensors[name], avatar.tensors[name])
+
+
+def test_killed_fit_resumes_to_the_same_result(fit, finished, tmp_path, monkeypatch):
+    """A fit stopped in its geometry and again in its appearance stages ends in the same bits as one that was not."""
+    from sira_mi.fit import driver
+
+    monkeypatch.setattr(driver, "_CHECKPOINT_SECONDS", 0.0)
+    real, count = driver._step, 0
+
+    def dies(*arguments):
+        nonlocal count
+        count += 1
+        if count in (11, 24):
+            raise RuntimeError("killed")
+        return real(*arguments)
+
+    monkeypatch.setattr(driver, "_step", dies)
+    out = tmp_path / "resumed"
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="killed"):
+            fit(out, example=True, resume=True)
+        assert not (out / "avatar.safetensors").exists()
+    assert fit(out, example=True, resume=True) == 0
+    once, twice = load_avatar(finished / "avatar.safetensors"), load_avatar(out / "avatar.safetensors")
+    for name, value in once.tensors.items():
+        assert np.array_equal(value, twice.tensors[name], equal_nan=True), name
+
+
+def test_interrupt_writes_what_there_is(fit, tmp_path, monkeypatch):
+    """Ctrl-C ends cleanly: exit code 130, a whole folder that says it is not complete, and the checkpoint stays."""
+    from sira_mi.fit import driver
+
+    monkeypatch.setattr(driver, "_CHECKPOINT_SECONDS", 0.0)
+    real, count = driver._step, 0
+
+    def interrupted(*arguments):
+        nonlocal count
+        count += 1
+        if count == 8:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(driver, "_step", interrupted)
+    assert fit(tmp_path / "a", example=True) == 130
+    assert json.loads((tmp_path / "a" / "avatar.json").read_text())["complete"] is False
+    assert (tmp_path / "a" / "contact.png").exists()
+    assert (tmp_path / "a" / ".fit" / "checkpoint.safetensors").exists()
+
+
+def test_checkpoint_of_another_fit_is_refused(tmp_path):
+    """A checkpoint goes on only with the photo, settings, seed and prior that it was made with."""
+    path = tmp_path / "checkpoint.safetensors"
+    save_progress(path, Progress({"z_sdf": np.zeros(3, np.float32)}, step=5, seconds={}, losses={}), "this fit")
+    assert load_progress(path, "this fit").step == 5
+    with pytest.raises(InputError, match="another photo"):
+        load_progress(path, "that fit")
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match="checkpoint"):
+        load_progress(path, "this fit")
+
+
+def _camera() -> Camera:
+    k = np.array([[300.0, 0, 70], [0, 300, 50], [0, 0, 1]])
+    world_to_camera = np.diag([1.0, -1, -1, 1])
+    world_to_camera[2, 3] = 12
+    return Camera(k, world_to_camera, 128, 96)
+
+
+def test_window_pixels_are_photo_pixels():
+    """A film pixel of a window's camera looks exactly where the photo pixel that it stands for does."""
+    camera = _camera()
+    window = window_around(10, 20, 100, 90, 12)
+    assert window.stride * window.size >= 90
+    columns, rows = window_pixels(window, (2, 1))
+    small = window_camera(camera, window, (2, 1))
+    _, expected = pixel_rays(camera, columns, rows)
+    _, found = pixel_rays(small, *np.meshgrid(np.arange(12), np.arange(12)))
+    assert np.allclose(expected, found, atol=1e-9)
+
+
+def test_modelled_pixels_leave_out_what_lies_below_the_floor():
+    """Rays that cross the domain box and leave it through its floor say nothing about the model."""
+    valid = modelled_pixels(_camera())
+    origin, direction = pixel_rays(_camera(), *np.meshgrid(np.arange(128), np.arange(96)))
+    at_back = origin + direction * ((-2.2 - origin[..., 2:]) / direction[..., 2:])
+    assert not valid[at_back[..., 1] < -3.0].any()
+    assert valid[48, 70] and valid.mean() > 0.3
+
+
+BAD_COMMANDS = {
+    "no photo": ([], "give one photo"),
+    "missing photo": (["nowhere.png"], "nowhere.png"),
+    "not an image": (["text.png"], "text.png"),
+    "no face": (["grey.png"], "face"),
+    "damaged prior": (["face.png", "--prior", "text.png"], "text.png"),
+    "foreign prior": (["face.png", "--prior", "foreign.safetensors"], "not an avatar"),
+    "malformed camera": (["face.png", "--camera", "text.png"], "text.png"),
+    "empty mask": (["face.png", "--mask", "black.png"], "mask"),
+    "camera that looks away": (["face.png", "--camera", "away.json"], "does not see the head"),
+    "output is a file": (["face.png", "--out", "text.png"], "text.png"),
+    "unknown variant": (["face.png", "--variant", "scalar_rgb"], "scalar_rgb"),
+    "negative seed": (["face.png", "--seed", "-1"], "--seed"),
+}
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory):
+    """A folder with good and bad inputs."""
+    from safetensors.numpy import save_file
+
+    folder = tmp_path_factory.mktemp("inputs")
+    Image.fromarray(skimage.data.astronaut()[:256, 90:346]).save(folder / "face.png")
+    Image.new("RGB", (200, 200), (128, 128, 128)).save(folder / "grey.png")
+    Image.new("L", (256, 256)).save(folder / "black.png")
+    (folder / "text.png").write_text("this is no image")
+    save_file({"x": np.zeros(3, np.float32)}, folder / "foreign.safetensors")
+    away = {"K": [[400, 0, 128], [0, 400, 128], [0, 0, 1]], "world_to_camera": np.eye(4).tolist(), "width": 256, "height": 256}
+    (folder / "away.json").write_text(json.dumps(away))
+    return folder
+
+
+@pytest.mark.parametrize("case", BAD_COMMANDS)
+def test_bad_input_is_one_clear_line(case, workshop, monkeypatch, capsys):
+    """Bad input ends with one line on stderr and exit code 2; nothing is left behind."""
+    from sira_mi.errors import run_command
+    from sira_mi.fit.__main__ import main
+
+    arguments, words = BAD_COMMANDS[case]
+    monkeypatch.chdir(workshop)
+    before = sorted(p.name for p in workshop.iterdir())
+    monkeypatch.setattr(sys, "argv", ["fit", *(["--out", "new"] if "--out" not in arguments else []), *arguments])
+    with pytest.raises(SystemExit) as end:
+        run_command(main)
+    error = capsys.readouterr().err.strip().splitlines()
+    mi.set_variant("llvm_ad_rgb")
+    assert end.value.code == 2
+    assert error[-1].startswith("error: ") and words in error[-1]
+    assert sum(line.startswith("error: ") for line in error) == 1
+    assert sorted(p.name for p in workshop.iterdir()) == before
+
+
+def test_command_line_from_outside(workshop, tmp_path):
+    """The command as a process: exit code 2 and no traceback."""
+    command = [sys.executable, "-m", "sira_mi.fit", "nowhere.png"]
+    result = subprocess.run(command, cwd=workshop, env=os.environ, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1 and "Traceback" not in result.stderr
+    assert PRIOR.stat().st_size < 5 << 20
