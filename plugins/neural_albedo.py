@@ -15,6 +15,13 @@ from sira_mi.fields.mlp import layers, pack
 from sira_mi.models.avatar import load_avatar
 
 
+def find_avatar(props) -> str:
+    """The path in a plugin's `avatar` property: relative to the scene file's folder if it is found there, else to the
+    current one; empty for the shipped prior."""
+    path = props.get("avatar", "")
+    return str(mi.file_resolver().resolve(path)) if path else ""
+
+
 class NeuralAlbedo(mi.Texture):
     r"""
     .. _texture-neural_albedo:
@@ -30,6 +37,10 @@ class NeuralAlbedo(mi.Texture):
      * - kind
        - |string|
        - `diffuse` (three channels, eqs 9a and 11) or `specular` (one channel, eq. 9b). (Default: `diffuse`)
+     * - baked
+       - |bool|
+       - Evaluate the networks once at every vertex of the `neural_sdf` that this texture belongs to, and interpolate
+         between vertices. (Default: false)
      * - weights
        - |Float|
        - Flat parameters of the albedo network.
@@ -55,6 +66,13 @@ class NeuralAlbedo(mi.Texture):
     `params.update()` after gradients are enabled. The three-channel texture gives its luminance where one channel is
     asked for; the one-channel texture gives grey where three are.
 
+    Networks make most of the cost of path tracing a head. A `baked` texture is looked up instead: the shape keeps its
+    albedo as the mesh attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (a number is appended where several
+    baked textures of one kind share a head) and renews it whenever parameters are changed through the scene or the
+    shape. It is as sharp as the mesh is fine: give the shape a `voxel` of 0.03 or less. It is detached: no gradient
+    reaches this texture's parameters, and enabling one raises RuntimeError at the next render. Outside of a
+    `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case.
+
     Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
 
     .. tabs::
@@ -66,7 +84,10 @@ class NeuralAlbedo(mi.Texture):
 
     def __init__(self, props):
         super().__init__(props)
-        avatar = load_avatar(props.get("avatar", ""))
+        avatar = load_avatar(find_avatar(props))
+        self.baked = bool(props.get("baked", False))
+        self.changed = False  # since a baked texture was last baked
+        self._attribute = None
         self.kind = props.get("kind", "diffuse")
         if self.kind not in ("diffuse", "specular"):
             raise ValueError(f"neural_albedo: kind is '{self.kind}', must be 'diffuse' or 'specular'")
@@ -85,6 +106,10 @@ class NeuralAlbedo(mi.Texture):
         column = mi.TensorXf(z_sdf, (len(z_sdf), 1))
         self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
         self._to_local = to_local
+
+    def bind_attribute(self, name: str) -> None:
+        """Tells a baked texture the mesh attribute that its shape keeps the albedo in."""
+        self._attribute = name
 
     def _network(self):
         column = mi.TensorXf(self.latent, (len(self.latent), 1))
@@ -116,7 +141,9 @@ class NeuralAlbedo(mi.Texture):
     def _evaluate(self, si) -> list:
         """The albedo at a surface interaction: three Floats (diffuse) or one (specular)."""
         if any(now and not then for now, then in zip(self._gradients(), self._attached, strict=True)):
-            raise RuntimeError("neural_albedo: gradients were enabled after the last update; call params.update() first")
+            raise RuntimeError("neural_albedo: gradients enabled since the last update; call params.update() first")
+        if self.baked:
+            return self._look_up(si)
         a = self.architecture
         x_ref, gamma = deform_cooperative(self._deformation, a.sdf_octaves, list(self._to_local @ si.p))
         if self.kind == "specular":
@@ -126,6 +153,15 @@ class NeuralAlbedo(mi.Texture):
             return base
         fine = albedo_refinement_cooperative(self._packed_refinement, a.refinement_octaves, x_ref, gamma)
         return [refined_albedo(b, r, self.k_r) for b, r in zip(base, fine, strict=True)]
+
+    def _look_up(self, si) -> list:
+        if self._attribute is None:
+            raise RuntimeError("neural_albedo: a baked texture works inside a neural_sdf only; leave baked out")
+        if any(self._gradients()):
+            raise RuntimeError("neural_albedo: a baked texture has no gradients; leave baked out to differentiate it")
+        if self.kind == "specular":
+            return [si.shape.eval_attribute_1(self._attribute, si)]
+        return list(si.shape.eval_attribute_3(self._attribute, si))
 
     def eval(self, si, active=True):
         albedo = self._evaluate(si)
@@ -156,9 +192,10 @@ class NeuralAlbedo(mi.Texture):
 
     def parameters_changed(self, keys=()):
         self._pack()
+        self.changed = True
 
     def to_string(self):
-        return f"NeuralAlbedo[kind = {self.kind}]"
+        return f"NeuralAlbedo[kind = {self.kind}, baked = {self.baked}]"
 
 
 mi.register_texture("neural_albedo", lambda props: NeuralAlbedo(props))

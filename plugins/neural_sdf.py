@@ -6,9 +6,9 @@ from sira_mi.fields import tracing
 from sira_mi.fields.columns import scatter_columns, to_columns
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, signed_distance, surface
 from sira_mi.models.avatar import load_avatar
-from sira_mi.plugins.neural_albedo import NeuralAlbedo
+from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 _FIELD_KEYS = ("deformation", "reference", "z_sdf")
 
@@ -46,7 +46,8 @@ class NeuralSDF(mi.Mesh):
        - |exposed|, |differentiable|, |discontinuous|
      * - (Nested plugin)
        - |bsdf|
-       - Any BSDF. A `neural_albedo` inside it takes its reference space from this shape.
+       - Any BSDF. A `neural_albedo` inside it takes its reference space from this shape; baked ones are kept as
+         attributes of the mesh.
 
     The field is SIRA's composed SDF: a deformation network maps a point and the latent to an offset δ and a feature
     vector γ (eq. 1), and the reference SDF is evaluated at x + δ (eqs 2 and 3). Its zero level set inside the domain
@@ -73,25 +74,31 @@ class NeuralSDF(mi.Mesh):
     """
 
     def __init__(self, props):
-        avatar = load_avatar(props.get("avatar", ""))
+        self.avatar_path = find_avatar(props)
+        avatar = load_avatar(self.avatar_path)
         self.voxel = float(props.get("voxel", 0.05))
         self.remesh_every = int(props.get("remesh_every", 1))
         if not 0.005 <= self.voxel <= 0.5:
             raise ValueError(f"neural_sdf: voxel is {self.voxel}, must lie in [0.005, 0.5] scene units")
         if self.remesh_every < 1:
             raise ValueError(f"neural_sdf: remesh_every is {self.remesh_every}, must be at least 1")
-        matrix = props.get("to_world", mi.ScalarTransform4f())
+        matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
+        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+        if not (scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < 1e-3):
+            raise ValueError("neural_sdf: to_world may rotate, translate and scale uniformly; it does more")
         super().__init__(props.id() or "neural_sdf", 1, 1, props=props, has_vertex_normals=True)
-        self.to_world = mi.Transform4f(mi.ScalarTransform4f(matrix).matrix)
+        self.to_world = mi.Transform4f(matrix)
         self.to_local = self.to_world.inverse()
         self.architecture = avatar.architecture
         self.deformation = mi.Float(avatar.tensors["deformation"])
         self.reference = mi.Float(avatar.tensors["reference"])
         self.z_sdf = mi.Float(avatar.tensors["z_sdf"])
         self._updates = 0
+        self._last_hits = None
         self._textures = [node for node in mi.traverse(self.bsdf()).hierarchy if isinstance(node, NeuralAlbedo)]
         self._bind_textures()
         self._extract()
+        self._add_attributes()
         self._attach()
 
     def field(self) -> SdfField:
@@ -120,11 +127,24 @@ class NeuralSDF(mi.Mesh):
             return t, dr.zeros(mi.Bool, width)
         local = self.to_local @ dr.detach(ray)
         columns = [to_columns(dr.gather(type(a), a, index)).numpy() for a in (local.o, local.d, mi.Float(t))]
-        field = self.field()
-        exact, f = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), *columns)
+        exact, f = self._newton(columns)
         hit = dr.zeros(mi.Bool, width)
         dr.scatter(hit, mi.Bool(np.abs(f[0]) < tracing.HIT_TOLERANCE), index)
         return scatter_columns(mi.TensorXf(exact), index, width, mi.Float), hit
+
+    def _newton(self, columns: list[np.ndarray]) -> list[np.ndarray]:
+        """Newton hits of rays [3, N], [3, N] from [1, N]. The last result is kept: `mi.render` traces the same rays once
+        for the picture and once more for its derivative."""
+        parameters = tuple(dr.detach(getattr(self, key)) for key in _FIELD_KEYS)
+        if self._last_hits is not None:
+            rays, then, result = self._last_hits
+            same_field = all(a.index == b.index for a, b in zip(parameters, then, strict=True))
+            if same_field and all(np.array_equal(a, b) for a, b in zip(columns, rays, strict=True)):
+                return result
+        field = self.field()
+        result = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), *columns)
+        self._last_hits = (columns, parameters, result) if columns[2].size <= CHUNK else None
+        return result
 
     def _evaluate(self, points: np.ndarray) -> np.ndarray:
         field = self.field()
@@ -156,11 +176,37 @@ class NeuralSDF(mi.Mesh):
         params = mi.traverse(self)
         params["vertex_positions"] = dr.ravel(position)
         params["faces"] = self._faces
+        for name, albedo in self._bake().items():
+            params[name] = albedo
         params.update()
 
     def _bind_textures(self) -> None:
         for texture in self._textures:
             texture.bind(self.architecture, self.deformation, self.z_sdf, self.to_local)
+
+    def _add_attributes(self) -> None:
+        """Makes an empty vertex attribute for every baked texture, and tells the textures their names."""
+        self._baked = {}
+        for texture in self._textures:
+            if texture.baked:
+                same = sum(t.kind == texture.kind for t in self._baked.values())
+                name = f"vertex_{texture.kind}_albedo" + (f"_{same + 1}" if same else "")
+                self._baked[name] = texture
+                texture.bind_attribute(name)
+                channels = 1 if texture.kind == "specular" else 3
+                self.add_attribute(name, channels, [0.0] * (channels * self.vertex_count()))
+
+    def _bake(self) -> dict:
+        """The baked textures' albedos at the vertices, as flat arrays by the name of their attribute."""
+        if not self._baked:
+            return {}
+        field, textures = self.field(), self._baked.values()
+        columns = evaluate_in_chunks(
+            lambda x: tuple(texture.evaluate_columns(*deform(field, x)) for texture in textures), self.vertices()
+        )
+        for texture in textures:
+            texture.changed = False
+        return {name: mi.Float(np.ravel(c.T)) for name, c in zip(self._baked, columns, strict=True)}
 
     def traverse(self, callback):
         super().traverse(callback)
@@ -170,6 +216,8 @@ class NeuralSDF(mi.Mesh):
     def parameters_changed(self, keys=()):
         if not any(key in keys for key in _FIELD_KEYS):
             super().parameters_changed(keys)
+            if any(texture.changed for texture in self._baked.values()):
+                self._renew_attributes()
             return
         self._bind_textures()
         self._updates += 1
@@ -177,10 +225,18 @@ class NeuralSDF(mi.Mesh):
             self._updates = 0
             self._extract()
             self._attach()
+        else:
+            self._renew_attributes()
+
+    def _renew_attributes(self) -> None:
+        if baked := self._bake():
+            params = mi.traverse(self)
+            for name, albedo in baked.items():
+                params[name] = albedo
+            params.update()
 
     def to_string(self):
         return f"NeuralSDF[voxel = {self.voxel}, vertices = {self._x0.shape[1]}]"
-
 
 
 def find_head(scene, integrator: str) -> NeuralSDF:

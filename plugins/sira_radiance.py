@@ -5,9 +5,10 @@ from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import normalised, signed_distance, signed_distance_and_slope, surface
+from sira_mi.fields.sdf import normalised, signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit
 from sira_mi.models.avatar import load_avatar
+from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
 # The closest approach that a ray outside the domain box is given, in scene units.
@@ -25,7 +26,7 @@ class SiraRadiance(mi.SamplingIntegrator):
 
      * - avatar
        - |string|
-       - An `avatar.safetensors`; empty for the mean head of the shipped prior. (Default: empty)
+       - An `avatar.safetensors`; empty for the one that the scene's head was loaded from. (Default: empty)
      * - mask_sharpness
        - |float|
        - α of the soft mask σ(−α min f), per scene unit. (Default: 50)
@@ -47,6 +48,9 @@ class SiraRadiance(mi.SamplingIntegrator):
     σ(−α min f) of IDR, and `closest`, min f along the ray in scene units (1 for rays outside the domain box), from
     which a mask loss is computed stably. Silhouettes get their gradients from these, colours theirs from the inside.
 
+    Without an `avatar` of its own, the networks are known from the first render on, and `rendering` and `z_r` are
+    exposed from then on; give `avatar` to differentiate them from the start.
+
     Networks are evaluated in tensor mode on all rays of a pass at once, so this integrator cannot be nested in
     symbolic code.
 
@@ -61,16 +65,24 @@ class SiraRadiance(mi.SamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        avatar = load_avatar(props.get("avatar", ""))
+        path = find_avatar(props)
         self.mask_sharpness = float(props.get("mask_sharpness", 50.0))
         if not self.mask_sharpness > 0:
             raise ValueError(f"sira_radiance: mask_sharpness is {self.mask_sharpness}, must be positive")
+        self.architecture = None
+        if path:
+            self._load(path)
+
+    def _load(self, path: str) -> None:
+        avatar = load_avatar(path)
         self.architecture = avatar.architecture
         self.rendering = mi.Float(avatar.tensors["rendering"])
         self.z_r = mi.Float(avatar.tensors["z_r"])
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         head = find_head(scene, "sira_radiance")
+        if self.architecture is None:
+            self._load(head.avatar_path)
         ray = mi.Ray3f(dr.detach(ray))
         width = dr.width(ray.o, ray.d)
         local = head.to_local @ ray
@@ -82,8 +94,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         index = dr.compress(hit)
         if dr.width(index) > 0:
             origin, direction, parameter = (to_columns(dr.gather(type(a), a, index)) for a in (local.o, local.d, t))
-            _, slope = signed_distance_and_slope(field, origin + parameter * direction, direction)
-            x = differentiable_hit(field, origin, direction, parameter, slope)
+            x = differentiable_hit(field, origin, direction, parameter)
             _, gradient, x_ref, gamma = surface(field, x)
             latent = mi.TensorXf(self.z_r, (len(self.z_r), 1))
             network = layers(self.architecture.networks["rendering"], self.rendering, latent)
@@ -111,8 +122,9 @@ class SiraRadiance(mi.SamplingIntegrator):
         return ["mask", "closest"]
 
     def traverse(self, callback):
-        callback.put("rendering", self.rendering, mi.ParamFlags.Differentiable)
-        callback.put("z_r", self.z_r, mi.ParamFlags.Differentiable)
+        if self.architecture is not None:
+            callback.put("rendering", self.rendering, mi.ParamFlags.Differentiable)
+            callback.put("z_r", self.z_r, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
         pass

@@ -3,8 +3,8 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
-from sira_mi.fields.sdf import evaluate_in_chunks, normalised, signed_distance_and_slope, surface
-from sira_mi.fields.tracing import differentiable_hit
+from sira_mi.fields.sdf import evaluate_in_chunks, normalised, surface
+from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.models.af_sm import physical_radiance
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.plugins.neural_sdf import find_head, trace_head
@@ -34,8 +34,8 @@ class SiraSG(mi.SamplingIntegrator):
     hit. Other shapes only occlude.
 
     Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s), `diffuse_albedo.RGB`, `specular_albedo`,
-    `normal.XYZ` (world, of the field), `depth` (distance along the ray, scene units) and `mask` (1 on the head). All are
-    zero off the head.
+    `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene units) and
+    `mask` (1 on the head). All are zero off the head.
 
     Hits are exact. Differentiable in everything that the scene exposes: lobes, albedo networks and latents, k_s and k_r,
     and, through implicit differentiation, the shape's latent and networks (interior derivatives; for silhouettes see
@@ -118,11 +118,10 @@ class SiraSG(mi.SamplingIntegrator):
 
         origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
         if not dr.grad_enabled(*differentiable_arrays(head, bsdf, light), origin, direction):
-            x = origin + parameter * direction
+            x = on_ray(origin, direction, parameter)
             return mi.TensorXf(evaluate_in_chunks(columns, x.numpy(), direction.numpy())[0])
         parameter = dr.detach(parameter)
-        _, slope = signed_distance_and_slope(field, origin + parameter * direction, direction)
-        return columns(differentiable_hit(field, origin, direction, parameter, slope), direction)
+        return columns(differentiable_hit(field, origin, direction, parameter), direction)
 
     def aov_names(self):
         names = []

@@ -24,9 +24,9 @@ def film(width: int, height: int) -> dict:
 
 
 def principal_point_offset(camera: Camera) -> tuple[float, float]:
-    """Mitsuba's offset of the principal point from the film's centre, in film sizes."""
+    """Mitsuba's offset of the film's centre from the principal point, in film sizes."""
     k = camera.K
-    return float(k[0, 2] / camera.width - 0.5), float(k[1, 2] / camera.height - 0.5)
+    return float(0.5 - k[0, 2] / camera.width), float(0.5 - k[1, 2] / camera.height)
 
 
 def sensor(camera: Camera, sampler: dict | None = None) -> dict:
@@ -39,7 +39,7 @@ def sensor(camera: Camera, sampler: dict | None = None) -> dict:
         "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.K[0, 0])))),
         "principal_point_offset_x": x,
         "principal_point_offset_y": y,
-        "near_clip": 0.01,
+        "near_clip": 0.001,
         "far_clip": 1000.0,
         "to_world": mi.ScalarTransform4f(to_world),
         "film": film(camera.width, camera.height),

@@ -11,7 +11,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-import sira_mi
 from sira_mi.errors import InputError, run_command
 
 
@@ -69,7 +68,7 @@ def train_appearance(collection: Path, out: Path, steps: int | None, seed: int) 
     if shape["z_sdf"].shape[1] != len(scenes):
         raise InputError(f"{out} was trained on {shape['z_sdf'].shape[1]} scenes, {collection} has {len(scenes)}")
     frozen = [
-        af_sm.freeze_scene(architecture, shape, shape["z_sdf"][:, k], scene, settings.jitter)
+        af_sm.freeze_scene(architecture, shape, shape["z_sdf"][:, k], scene, settings, np.random.default_rng([seed, 5, k]))
         for k, scene in enumerate(scenes)
     ]
     initial = af_sm.initial_appearance_model(architecture, len(scenes), seed)

@@ -10,6 +10,7 @@ import pytest
 from sira_mi.fields.appearance import fibonacci_directions
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
+from sira_mi.portrait.camera import Camera
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -106,13 +107,22 @@ def avatar_path(avatar, tmp_path_factory) -> str:
     return str(path)
 
 
-def slopes(loss, value: np.ndarray, gradient: np.ndarray, step: float, seed: int = 0) -> tuple[float, float]:
+def slopes(loss, value: np.ndarray, gradient: np.ndarray, change: float, seed: int = 0) -> tuple[float, float]:
     """(AD, central difference) of `loss` along a direction that weighs the entries of `gradient` at random and has a
-    random part; `step` is the change of the whole vector, in its own units."""
+    random part. The step is such that by AD the loss changes by the share `change` of itself either way, and the value
+    by at most 3%."""
     rng = np.random.default_rng(seed)
     weighted = gradient * rng.uniform(0, 2, gradient.shape)
     noise = rng.standard_normal(gradient.shape)
     direction = weighted / np.linalg.norm(weighted) + 0.5 * noise / np.linalg.norm(noise)
-    direction /= np.linalg.norm(direction)
+    slope = float((gradient * direction).sum())
+    step = min(change * abs(loss(value)) / abs(slope), 0.03 * float(np.linalg.norm(value)))
     ahead, behind = (loss((value + sign * step * direction).astype(np.float32)) for sign in (1, -1))
-    return float((gradient * direction).sum()), (ahead - behind) / (2 * step)
+    return slope, float(ahead - behind) / (2 * step)
+
+
+def camera(focal: float, size: int = 32) -> Camera:
+    """A camera five units before the head, looking at it; `focal` in pixels."""
+    k = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    world_to_camera = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 5], [0, 0, 0, 1]])
+    return Camera(k, world_to_camera, size, size)

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from sira_mi.collection import build as building
-from sira_mi.collection import hair, landmarks, makehuman, person, render, scene, skin, surface
+from sira_mi.collection import hair, landmarks, look, makehuman, outer, person, render, scene, skin, surface
 from sira_mi.collection.annotate_landmarks import attach, symmetrise
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
 from sira_mi.errors import InputError
@@ -184,10 +184,10 @@ def test_skin_stays_within_the_measured_range():
     for seed in range(6):
         random = np.random.default_rng(seed)
         identity = random_identity(seed)
-        look = skin.sample_look(random, identity, True)
-        cloth = skin.cloth_mask(look)
+        drawn = look.sample_look(random, identity, True)
+        cloth = skin.cloth_mask(drawn)
         none = np.zeros(len(cloth))
-        albedo, specular = skin.paint_head(identity, look, cloth, none)
+        albedo, specular = skin.paint_head(drawn, cloth, none)
         rest = skin.rest_surface()
         cheek = (np.abs(np.abs(rest[:, 0]) - 0.4) < 0.1) & (np.abs(rest[:, 1] - 7.0) < 0.08) & (rest[:, 2] > 1.0)
         mean = albedo[cheek].mean(0)
@@ -204,7 +204,7 @@ def test_point_triangle_distance_against_dense_sampling():
     bary = np.stack([1 - a - b, a, b], -1)[a + b <= 1]
     dense = np.einsum("sk,nkd->nsd", bary, corners)
     reference = np.linalg.norm(dense - points[:, None], axis=2).min(1)
-    assert np.allclose(scene.point_triangle_distance(points, corners), reference, atol=0.01)
+    assert np.allclose(outer.point_triangle_distance(points, corners), reference, atol=0.01)
 
 
 def test_scene_has_the_documented_layout(arrays):

@@ -14,13 +14,14 @@ from sira_mi.fields.encoding import encode, encode_cooperative, encode_with_tang
 RADIUS = 1.2
 
 
-def head_field(avatar, dtype=mi.Float, **replaced) -> sdf.SdfField:
-    tensors = {**avatar.tensors, **replaced}
+def head_field(avatar, **replaced) -> sdf.SdfField:
+    """The avatar's field, with some of `deformation`, `reference` and `z_sdf` replaced by Floats."""
+    values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")} | replaced
     networks = avatar.architecture.networks
-    latent = mi.TensorXf(dtype(tensors["z_sdf"]), (len(tensors["z_sdf"]), 1))
+    latent = mi.TensorXf(values["z_sdf"], (len(values["z_sdf"]), 1))
     return sdf.SdfField(
-        mlp.layers(networks["deformation"], mi.Float(tensors["deformation"]), latent),
-        mlp.layers(networks["reference"], mi.Float(tensors["reference"])),
+        mlp.layers(networks["deformation"], values["deformation"], latent),
+        mlp.layers(networks["reference"], values["reference"]),
         avatar.architecture.sdf_octaves,
     )
 
@@ -97,7 +98,7 @@ def test_geometric_initialisation_is_a_coarse_sphere():
 def test_both_modes_and_float64_agree_in_value_and_gradient(avatar, name):
     """Every decoder that exists in both modes is a composition of these and of the encoding, tested below."""
     architecture = SMALL.networks[name]
-    latent = next((avatar.tensors[z] for z, n in (("z_sdf", "deformation"), ("z_a", "diffuse_albedo")) if n == name), None)
+    latent = avatar.tensors.get({"deformation": "z_sdf", "diffuse_albedo": "z_a"}.get(name))
     h = np.random.default_rng(1).uniform(-1, 1, (architecture.inputs, 500)).astype(np.float32)
     weight = mi.TensorXf(np.random.default_rng(2).standard_normal((architecture.outputs, 500)).astype(np.float32))
 
@@ -134,7 +135,7 @@ def test_appearance_decoders_agree_in_both_modes(avatar):
 
     field = head_field(avatar)
     x_ref, gamma = sdf.deform(field, mi.TensorXf(x))
-    point, features = appearance.deform_cooperative(mlp.pack(field.deformation), SMALL.sdf_octaves, [mi.Float(c) for c in x])
+    point, features = appearance.deform_cooperative(mlp.pack(field.deformation), 2, [mi.Float(c) for c in x])
     a, s, r = layers("diffuse_albedo", "z_a"), layers("specular_albedo", "z_s"), layers("albedo_refinement")
     pairs = [
         (x_ref, point),
@@ -202,17 +203,12 @@ def test_gradients_repeat_bit_for_bit(avatar):
     x = mi.TensorXf(points_near_surface(20000))
 
     def gradient():
-        values = [mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")]
-        dr.enable_grad(*values)
-        networks = SMALL.networks
-        latent = mi.TensorXf(values[2], (SMALL.sdf_latent, 1))
-        field = sdf.SdfField(
-            mlp.layers(networks["deformation"], values[0], latent), mlp.layers(networks["reference"], values[1]), 2
-        )
-        f, slope, x_ref, gamma = sdf.surface(field, x)
+        values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")}
+        dr.enable_grad(values)
+        f, slope, x_ref, gamma = sdf.surface(head_field(avatar, **values), x)
         total = f * f + dr.sum(slope * x_ref, axis=0) + dr.sum(gamma * gamma, axis=0)
         dr.backward(dr.mean(total, axis=None))
-        return [dr.grad(v).numpy() for v in values]
+        return [dr.grad(v).numpy() for v in values.values()]
 
     first = gradient()
     for _ in range(4):
@@ -260,26 +256,19 @@ def test_derivative_of_the_eikonal_loss_equals_differences(avatar, name):
     x = mi.TensorXf(points_near_surface(400))
 
     def loss(value, attached=False):
-        values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")} | {name: mi.Float(value)}
+        value = mi.Float(value)
         if attached:
-            dr.enable_grad(values[name])
-        networks = SMALL.networks
-        latent = mi.TensorXf(values["z_sdf"], (SMALL.sdf_latent, 1))
-        field = sdf.SdfField(
-            mlp.layers(networks["deformation"], values["deformation"], latent),
-            mlp.layers(networks["reference"], values["reference"]),
-            2,
-        )
-        gradient = sdf.surface(field, x)[1]
+            dr.enable_grad(value)
+        gradient = sdf.surface(head_field(avatar, **{name: value}), x)[1]
         deviation = dr.sum(gradient * gradient, axis=0) - 1
         result = dr.mean(deviation * deviation, axis=None)
         if not attached:
             return float(result.numpy().item())
         dr.backward(result)
-        return dr.grad(values[name]).numpy()
+        return dr.grad(value).numpy()
 
     start = avatar.tensors[name]
-    ad, difference = slopes(loss, start, loss(start, attached=True), 2e-3 if name == "reference" else 5e-3)
+    ad, difference = slopes(loss, start, loss(start, attached=True), 5e-3)
     assert ad == pytest.approx(difference, rel=1e-3)
 
 
@@ -301,7 +290,7 @@ def test_extracted_sphere_has_the_volume_and_area_of_a_sphere():
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=2e-3)
     assert mesh.area == pytest.approx(4 * np.pi * RADIUS**2, rel=2e-3)
     outward = (mesh.face_normals * mesh.triangles_center).sum(axis=1)
-    assert outward.min() > 0
+    assert (outward[mesh.area_faces > 1e-7] > 0).all()
 
 
 def test_coarse_to_fine_extraction_equals_the_dense_one(avatar):
@@ -321,8 +310,7 @@ def test_a_solid_that_leaves_the_box_is_closed_along_it():
     mesh = watertight(surface)
     lower, upper = mesh.bounds
     assert lower == pytest.approx(DOMAIN_LOWER, abs=1e-3)
-    assert upper[1] == pytest.approx(0.5, abs=1e-5)
-    assert (upper <= np.array(DOMAIN_UPPER) + 0.81).all() and upper[0] >= DOMAIN_UPPER[0] - 1e-3
+    assert upper == pytest.approx((DOMAIN_UPPER[0], 0.5, DOMAIN_UPPER[2]), abs=1e-3)
     on_lid = np.abs(surface.vertices[:, 1] - 0.5) < 1e-5
     inside = np.abs(surface.vertices[:, 0]) < 2.4
     assert not surface.on_box[on_lid & inside & (np.abs(surface.vertices[:, 2]) < 1.8)].any()
@@ -352,8 +340,9 @@ def rays_at_head(count: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 
 def exact_hits(field, origin, direction):
-    outside, inside = mi.TensorXf(np.full((1, origin.shape[1]), 1.8, np.float32)), mi.TensorXf(
-        np.full((1, origin.shape[1]), 4.0, np.float32)
+    outside, inside = (
+        mi.TensorXf(np.full((1, origin.shape[1]), 1.8, np.float32)),
+        mi.TensorXf(np.full((1, origin.shape[1]), 4.0, np.float32)),
     )
     return tracing.bisection_hits_reference(field, mi.TensorXf(origin), mi.TensorXf(direction), outside, inside)
 
@@ -363,45 +352,59 @@ def test_newton_steps_reach_the_bisected_hit_from_two_millimetres_off(avatar, of
     field = head_field(avatar)
     origin, direction = rays_at_head(500)
     exact = exact_hits(field, origin, direction).numpy()
-    t, f = tracing.newton_hits(field, mi.TensorXf(origin), mi.TensorXf(direction), mi.TensorXf(exact + np.float32(offset)))
+    start = mi.TensorXf(exact + np.float32(offset))
+    t, f = tracing.newton_hits(field, mi.TensorXf(origin), mi.TensorXf(direction), start)
     assert np.abs(t.numpy() - exact).max() < 1e-4
     assert np.abs(f.numpy()).max() < tracing.HIT_TOLERANCE
 
 
 def test_a_ray_that_misses_is_not_a_hit(avatar):
     origin, direction = np.array([[3.0], [0], [5]], np.float32), np.array([[0.0], [0], [-1]], np.float32)
-    _, f = tracing.newton_hits(head_field(avatar), *(mi.TensorXf(a) for a in (origin, direction, [[5.0]])))
-    assert abs(f.numpy().item()) > tracing.HIT_TOLERANCE
+    t = mi.TensorXf(np.array([[5.0]], np.float32))
+    _, f = tracing.newton_hits(head_field(avatar), mi.TensorXf(origin), mi.TensorXf(direction), t)
+    assert f.shape == (1, 1) and abs(f.numpy().item()) > tracing.HIT_TOLERANCE
+
+
+def test_a_single_ray_is_traced_as_one_of_many(avatar):
+    """Dr.Jit 1.5 widens an unevaluated [1, 1] tensor in place when it is multiplied by a [3, 1] one."""
+    field = head_field(avatar)
+    origin, direction = rays_at_head(5)
+    start = exact_hits(field, origin, direction).numpy() + np.float32(0.03)
+    t, _ = tracing.newton_hits(field, *(mi.TensorXf(a) for a in (origin, direction, start)))
+    alone = [mi.TensorXf(np.ascontiguousarray(a[:, 2:3])) for a in (origin, direction, start)]
+    single, _ = tracing.newton_hits(field, *alone)
+    assert single.numpy().item() == pytest.approx(t.numpy()[0, 2], abs=1e-6)
+    x = tracing.differentiable_hit(field, alone[0], alone[1], single + 0)
+    assert x.shape == (3, 1) and np.isfinite(x.numpy()).all()
 
 
 @pytest.mark.parametrize("name", ["deformation", "reference", "z_sdf"])
 def test_differentiable_hit_moves_as_the_traced_hit_does(avatar, name):
     origin, direction = rays_at_head(200)
     start = avatar.tensors[name]
-    weight = np.random.default_rng(1).standard_normal(200)
+    weight = np.random.default_rng(1).uniform(0, 1, 200)
 
     def loss(value):
-        hits = exact_hits(head_field(avatar, **{name: value}), origin, direction).numpy()[0]
-        return float((hits * weight).mean())
+        """Mean weighted hit by bisection in float64."""
+        head = avatar.replaced(**{name: value})
+        near, far = np.full(200, 1.8), np.full(200, 4.0)
+        for _ in range(45):
+            middle = 0.5 * (near + far)
+            outside = field_in_double(head, origin + middle * direction.astype(np.float64)) > 0
+            near, far = np.where(outside, middle, near), np.where(outside, far, middle)
+        return float((near * weight).mean())
 
-    values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")}
-    dr.enable_grad(values[name])
-    networks = SMALL.networks
-    latent = mi.TensorXf(values["z_sdf"], (SMALL.sdf_latent, 1))
-    field = sdf.SdfField(
-        mlp.layers(networks["deformation"], values["deformation"], latent),
-        mlp.layers(networks["reference"], values["reference"]),
-        2,
-    )
+    value = mi.Float(start)
+    dr.enable_grad(value)
+    field = head_field(avatar, **{name: value})
     o, d = mi.TensorXf(origin), mi.TensorXf(direction)
     with dr.suspend_grad():
         t = exact_hits(field, origin, direction)
-        _, slope = sdf.signed_distance_and_slope(field, o + t * d, d)
-    x = tracing.differentiable_hit(field, o, d, t, slope)
+    x = tracing.differentiable_hit(field, o, d, t)
     np.testing.assert_allclose(x.numpy(), origin + t.numpy() * direction, atol=1e-6)
     along = dr.sum((x - o) * d, axis=0)
     dr.backward(dr.mean(along * mi.TensorXf(weight.astype(np.float32)), axis=None))
-    ad, difference = slopes(loss, start, dr.grad(values[name]).numpy(), 5e-3)
+    ad, difference = slopes(loss, start, dr.grad(value).numpy(), 2e-4)
     assert ad == pytest.approx(difference, rel=1e-3)
 
 
@@ -423,7 +426,6 @@ def test_closest_approach_finds_the_smallest_distance_along_a_ray(avatar):
     relevant = np.abs(best) < 0.1  # where the mask is decided; away from the surface the grid only interpolates
     assert relevant.sum() > 30
     assert (found - best)[relevant].max() < 1e-3
-    assert (found - best).max() < 0.05
 
 
 def test_distance_grid_is_exact_on_a_linear_field_and_constant_outside():

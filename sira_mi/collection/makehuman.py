@@ -61,7 +61,7 @@ class Pack:
 class Identity:
     years: float  # age, years
     male: float  # 0 female to 1 male
-    ancestry: tuple[float, float, float]  # shares of `ANCESTRIES`, sum 1
+    ancestry: tuple[float, ...]  # shares of `ANCESTRIES`, sum 1
     muscle: float  # 0 to 1, 0.5 average
     weight: float  # 0 to 1, 0.5 average
     arms: float  # how far the arms are lowered from the rest pose, radians
@@ -92,7 +92,7 @@ def axes() -> dict[str, tuple[tuple[str | None, str], ...]]:
     """Local axes by category: each the names of its negative target (None if it has none) and its positive target."""
     names = [name for name in load_pack().targets if not name.startswith("macrodetails/")]
     found: dict[str, list] = {category: [] for category in DEVIATIONS}
-    paired = set()
+    paired: set[str] = set()
     for name in names:
         for negative, positive in (*OPPOSITES, ("l", "r")):
             if (negative, positive) == ("l", "r") and not name.startswith("asym/"):

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from sira_mi.collection import hair as hairs
 from sira_mi.collection import skin
+from sira_mi.collection.look import Look, sample_look
 from sira_mi.collection.makehuman import Identity, identity_vertices, sample_identity
 from sira_mi.collection.render import Part
 from sira_mi.collection.surface import eye_spheres, unit_eye, vertex_normals
@@ -46,7 +47,7 @@ class Cut:
 @dataclass(frozen=True)
 class Person:
     identity: Identity
-    look: skin.Look
+    look: Look
     cut: Cut | None
     control: np.ndarray  # [19158, 3] base-mesh vertices, scene units
     head: np.ndarray  # [M, 3] vertices of the dressed head
@@ -75,14 +76,14 @@ def make_person(seed: int, hair_folder: Path | None) -> Person:
     wears = random.random() < HAIR_SHARE
     if hair_folder is not None and wears:
         cut = sample_cut(random, hairs.list_hair(hair_folder), identity.male)
-    look = skin.sample_look(random, identity, cut is not None)
+    look = sample_look(random, identity, cut is not None)
     control = identity_vertices(identity)
     head, triangles, cloth = skin.body_under(control, look)
     volume = None
     covered = np.zeros(len(head))
     if cut is not None:
         volume, covered = _wear(cut, hair_folder, control, head, look, random)
-    albedo, specular = skin.paint_head(identity, look, cloth, covered)
+    albedo, specular = skin.paint_head(look, cloth, covered)
     region = np.where(cloth[triangles].mean(1) > 0.5, skin.CLOTH, skin.SKIN)
     parts = [Part(head, triangles, vertex_normals(head, triangles), albedo, specular, region)]
     unit, eye_triangles = unit_eye()

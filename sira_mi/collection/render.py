@@ -16,7 +16,7 @@ ROUGHNESS = 0.5
 @dataclass(frozen=True)
 class RenderSettings:
     size: int = 160  # pixels, width and height of a view
-    samples: int = 48  # paths a pixel
+    samples: int = 40  # paths a pixel
     depth: int = 4  # path length, bounces
     frontal_luminance: tuple[float, float] = (0.22, 0.4)  # mean linear luminance of the head in the frontal view
 
@@ -118,47 +118,61 @@ def build_scene(parts: list[Part], light: np.ndarray, settings: RenderSettings) 
 def render_views(
     scene: mi.Scene, intrinsics: np.ndarray, poses: np.ndarray, settings: RenderSettings, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear images [V, H, W, 3] and coverage [V, H, W] in 0..1, all views in one launch."""
-    size = settings.size
-    sensors = {}
-    for index, (intrinsic, pose) in enumerate(zip(intrinsics, poses, strict=True)):
-        to_world = np.linalg.inv(pose.astype(np.float64)) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        sensors[f"view{index:03d}"] = {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(0.5 * size / intrinsic[0, 0]))),
-            "near_clip": 0.1,
-            "far_clip": 100.0,
-            "to_world": mi.ScalarTransform4f(to_world),
-        }
-    film = {
-        "type": "hdrfilm",
-        "width": size * len(poses),
-        "height": size,
-        "pixel_format": "rgba",
-        "rfilter": {"type": "box"},
-    }
-    sampler = {"type": "independent", "sample_count": settings.samples}
-    sensor = mi.load_dict({"type": "batch", "film": film, "sampler": sampler, **sensors})
-    image = np.array(mi.render(scene, sensor=sensor, spp=settings.samples, seed=seed))
-    views = image.reshape(size, len(poses), size, 4).transpose(1, 0, 2, 3)
-    return views[..., :3], np.clip(views[..., 3], 0, 1)
+    """Linear images [V, H, W, 3] and coverage [V, H, W] in 0..1, all views in one launch. Pixels are box-filtered by
+    sums in a fixed order, so that results repeat whatever the number of threads."""
+    views, size, samples = len(poses), settings.size, settings.samples
+    sampler = mi.load_dict({"type": "independent", "sample_count": samples})
+    count = views * size * size * samples
+    sampler.seed(seed, count)
+    pixel = dr.arange(mi.UInt32, count) // samples
+    view = pixel // (size * size)
+    jitter = sampler.next_2d()
+    x = mi.Float(pixel % size) + jitter.x
+    y = mi.Float(pixel // size % size) + jitter.y
+    ray = mi.RayDifferential3f(_camera_ray(intrinsics, poses, view, x, y))
+    radiance, valid, _ = scene.integrator().sample(scene, sampler, ray)
+    channels = [*radiance, dr.select(valid, mi.Float(1), mi.Float(0))]
+    dr.eval(channels)
+    channels = [dr.block_sum(channel, samples) / samples for channel in channels]
+    image = np.stack([np.array(c) for c in channels], axis=-1).reshape(views, size, size, 4)
+    return image[..., :3], np.clip(image[..., 3], 0, 1)
 
 
-def occluded(scene: mi.Scene, origins: np.ndarray, targets: np.ndarray | None, direction: np.ndarray | None = None):
-    """Whether something lies between origins [N, 3] and targets [N, 3] or, without targets, along a far direction
-    [3] or [N, 3]; bool [N]."""
-    ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(0, 0, 1))
-    if targets is None:
-        way = np.broadcast_to(direction, origins.shape)
-        ray.maxt = mi.Float(1e4)
-    else:
-        way = targets - origins
-        distance = np.linalg.norm(way, axis=1)
-        way = way / distance[:, None]
-        ray.maxt = mi.Float(distance.astype(np.float32))
-    ray.d = mi.Vector3f(np.ascontiguousarray(way.T).astype(np.float32))
-    dr.make_opaque(ray)
+def _camera_ray(intrinsics, poses, view, x, y):
+    """World-space rays through pixel positions (x, y) of OpenCV cameras chosen by `view`."""
+    to_world = np.linalg.inv(poses.astype(np.float64))
+    directions = to_world[:, :3, :3] @ np.linalg.inv(intrinsics.astype(np.float64))
+
+    def entry(values):
+        return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values, dtype=np.float32)), view)
+
+    way = [
+        entry(directions[:, k, 0]) * x + entry(directions[:, k, 1]) * y + entry(directions[:, k, 2]) for k in range(3)
+    ]
+    origin = [entry(to_world[:, k, 3]) for k in range(3)]
+    return mi.Ray3f(mi.Point3f(*origin), dr.normalize(mi.Vector3f(*way)))
+
+
+def blocked_towards(scene: mi.Scene, origins: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Whether something lies between origins [N, 3] and a target [3], bool [N]."""
+    way = target - origins
+    distance = np.linalg.norm(way, axis=1)
+    return _blocked(scene, origins, way / distance[:, None], distance)
+
+
+def blocked_along(scene: mi.Scene, origins: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Whether something lies in a direction [3], however far, of origins [N, 3]; bool [N]."""
+    return _blocked(scene, origins, np.broadcast_to(direction, origins.shape), np.full(len(origins), 1e4))
+
+
+def _blocked(scene, origins, directions, distances):
+    ray = mi.Ray3f(_columns(origins), mi.Vector3f(_columns(directions)))
+    ray.maxt = mi.Float(distances.astype(np.float32))
     return np.array(scene.ray_test(ray)).astype(bool)
+
+
+def _columns(rows):
+    return mi.Point3f(np.ascontiguousarray(rows.T.astype(np.float32)))
 
 
 def exposure(image: np.ndarray, weight: np.ndarray, target: float) -> float:

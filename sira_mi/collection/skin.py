@@ -4,13 +4,13 @@ Regions are painted in rest-pose coordinates of the base mesh (decimetres), whic
 Skin tone has two axes, melanin and haemoglobin, as exponents of an absorption (after Tsumura et al. 1999).
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from scipy import sparse
 
-from sira_mi.collection.makehuman import Identity, load_pack
+from sira_mi.collection.look import Look
+from sira_mi.collection.makehuman import load_pack
 from sira_mi.collection.surface import head_surface, head_topology, refine_attribute, vertex_normals
 
 SKIN, HAIR, EYE, CLOTH = 0, 1, 2, 3
@@ -21,27 +21,6 @@ DARK_SKIN = np.array([0.06, 0.035, 0.025])
 MELANIN_BEND = np.array([-0.3, 0.0, 0.15])
 HAEMOGLOBIN = np.array([0.03, -0.12, -0.07])
 REDNESS = np.array([0.02, -0.40, -0.34])
-# Mean melanin of `makehuman.ANCESTRIES`.
-MELANIN = np.array([0.78, 0.3, 0.13])
-
-HAIR_COLOURS = {
-    "black": (0.012, 0.010, 0.009),
-    "dark brown": (0.045, 0.026, 0.016),
-    "brown": (0.12, 0.068, 0.036),
-    "light brown": (0.22, 0.135, 0.072),
-    "blond": (0.46, 0.32, 0.16),
-    "red": (0.30, 0.085, 0.025),
-    "grey": (0.36, 0.35, 0.34),
-    "white": (0.62, 0.61, 0.58),
-}
-IRIS_COLOURS = {
-    "brown": (0.055, 0.025, 0.012),
-    "dark brown": (0.025, 0.012, 0.008),
-    "hazel": (0.12, 0.075, 0.025),
-    "green": (0.11, 0.14, 0.06),
-    "blue": (0.10, 0.18, 0.30),
-    "grey": (0.19, 0.21, 0.22),
-}
 SCLERA = np.array([0.66, 0.60, 0.57])
 IRIS_RADIUS = 0.062  # scene units
 # Rest-pose eyebrow centre line of the left side: x, y, half height.
@@ -52,95 +31,6 @@ BROW = np.array(
 HAIRLINE = np.array(
     [[0, 8.02], [25, 8.0], [42, 7.93], [55, 7.62], [75, 7.42], [95, 7.38], [115, 7.0], [140, 6.68], [180, 6.6]]
 )
-
-
-@dataclass(frozen=True)
-class Look:
-    """What is drawn per identity besides its shape; colours are linear."""
-
-    melanin: float  # 0 light to 1 dark
-    haemoglobin: float  # standard deviations
-    redness: float  # strength on cheeks, nose and ears
-    hair_name: str  # key of `HAIR_COLOURS`
-    hair_colour: tuple[float, float, float]
-    iris_name: str  # key of `IRIS_COLOURS`
-    iris_colour: tuple[float, float, float]
-    gaze: tuple[float, float]  # radians, yaw and pitch
-    brow_strength: float  # 0 to 1
-    brow_width: float  # factor on the brows' height
-    stubble: float  # 0 none to 1 a dense short beard, painted
-    freckles: float  # 0 none to 1
-    lipstick: tuple[float, float, float] | None
-    scalp: float  # strength of painted hair on the scalp, 0 bald to 1
-    specular: float  # base specular strength of the skin
-    cloth_colour: tuple[float, float, float]
-    shirt_colour: tuple[float, float, float] | None  # a second cloth down the middle, as under a jacket
-    collar: float  # decimetres that the neck line is moved up
-    neck_opening: float  # decimetres that a V-neck is deep
-    cloth_thickness: float  # scene units
-    seed: int  # of the fine noise
-
-
-def sample_look(random: np.random.Generator, identity: Identity, has_hair: bool) -> Look:
-    """Colours and details that go with an identity's age, sex and ancestry."""
-    share = np.array(identity.ancestry)
-    melanin = float(np.clip(share @ MELANIN + random.normal(0, 0.11), 0, 1))
-    hair_name = _hair_name(random, identity)
-    spread = np.exp(random.normal(0, 0.18) + random.normal(0, 0.05, 3))
-    light_eyes = share[2] * 0.75
-    iris_name = str(random.choice(["blue", "green", "hazel", "grey"])) if random.random() < light_eyes else "brown"
-    if iris_name == "brown" and random.random() < share[0] + share[1]:
-        iris_name = "dark brown"
-    male = identity.male > 0.5
-    lipstick = None
-    if not male and random.random() < 0.3:
-        lipstick = tuple(float(c) for c in np.array([0.42, 0.05, 0.07]) * np.exp(random.normal(0, [0.3, 0.4, 0.3])))
-    return Look(
-        melanin=melanin,
-        haemoglobin=float(random.normal(0.3, 0.6)),
-        redness=float(random.uniform(0.3, 1.2)),
-        hair_name=hair_name,
-        hair_colour=tuple(float(c) for c in np.array(HAIR_COLOURS[hair_name]) * spread),
-        iris_name=iris_name,
-        iris_colour=tuple(float(c) for c in np.array(IRIS_COLOURS[iris_name]) * np.exp(random.normal(0, 0.25))),
-        gaze=(float(random.normal(0, 0.10)), float(random.normal(0, 0.05))),
-        brow_strength=float(random.uniform(0.5, 0.95)),
-        brow_width=float(random.uniform(0.75, 1.25) * (1.15 if male else 0.9)),
-        stubble=float(random.beta(0.9, 1.3)) if male and random.random() < 0.6 else 0.0,
-        freckles=float(random.uniform(0.3, 1)) if melanin < 0.35 and random.random() < 0.25 else 0.0,
-        lipstick=lipstick,
-        scalp=0.0 if has_hair or random.random() < 0.35 else float(random.uniform(0.35, 0.95)),
-        specular=float(np.clip(random.normal(0.375, 0.09), 0.15, 0.65)),
-        cloth_colour=_cloth_colour(random),
-        shirt_colour=_cloth_colour(random) if random.random() < 0.3 else None,
-        collar=float(random.choice([random.normal(0, 0.06), random.uniform(0.1, 0.3)], p=[0.8, 0.2])),
-        neck_opening=float(random.choice([random.uniform(0, 0.12), random.uniform(0.15, 0.5)], p=[0.6, 0.4])),
-        cloth_thickness=float(random.uniform(0.03, 0.16)),
-        seed=int(random.integers(2**31)),
-    )
-
-
-def _hair_name(random, identity):
-    grey = np.clip((identity.years - 42) / 35, 0, 1)
-    if random.random() < grey:
-        return str(random.choice(["grey", "white"], p=[0.7, 0.3] if identity.years < 70 else [0.4, 0.6]))
-    if random.random() < identity.ancestry[0] + identity.ancestry[1]:
-        return str(random.choice(["black", "dark brown", "brown"], p=[0.6, 0.3, 0.1]))
-    names = ["black", "dark brown", "brown", "light brown", "blond", "red"]
-    return str(random.choice(names, p=[0.08, 0.24, 0.26, 0.16, 0.18, 0.08]))
-
-
-def _cloth_colour(random):
-    kind = random.random()
-    if kind < 0.2:
-        colour = np.full(3, random.uniform(0.5, 0.82)) * np.exp(random.normal(0, 0.03, 3))
-    elif kind < 0.45:
-        colour = np.exp(random.uniform(-4.2, -2.6) + random.normal(0, 0.25, 3))
-    else:
-        hue = random.uniform(0, 6)
-        pure = np.clip(np.abs((hue + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
-        colour = (1 - random.uniform(0.2, 0.95) * (1 - pure)) * random.uniform(0.08, 0.65)
-    return tuple(float(c) for c in np.clip(colour, 0.01, 0.85))
 
 
 @cache
@@ -227,7 +117,7 @@ def beard_mask() -> np.ndarray:
     return below_cheek * above_throat * step(z, 0.45, 0.7) * (1 - np.clip(1.6 * lips, 0, 1))
 
 
-def paint_head(identity: Identity, look: Look, cloth: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def paint_head(look: Look, cloth: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Diffuse albedo [M, 3] and specular strength [M] of skin and clothes; `covered` [M] is 1 under modelled hair."""
     random = np.random.default_rng(look.seed)
     rest = rest_surface()
@@ -258,7 +148,7 @@ def paint_head(identity: Identity, look: Look, cloth: np.ndarray, covered: np.nd
     grain = np.clip(0.85 + 0.15 * noise(rest, 0.06, random), 0, 1)
     skin = _mix(skin, hair, np.maximum(scalp * look.scalp * grain, covered))
     brows = brow_mask(look) * look.brow_strength * np.clip(0.85 + 0.25 * noise(rest, 0.05, random), 0, 1)
-    skin = _mix(skin, np.minimum(hair, 0.22) * 0.8, brows)
+    skin = _mix(skin, np.minimum(0.8 * np.minimum(hair, 0.22), 0.5 * skin), brows)
 
     zone = np.exp(-(((rest - [0, 7.05, 1.6]) / [0.14, 0.25, 0.3]) ** 2).sum(1))
     zone = np.maximum(zone, 0.8 * np.exp(-(((rest - [0, 7.75, 1.4]) / [0.4, 0.25, 0.4]) ** 2).sum(1)))

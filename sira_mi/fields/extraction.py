@@ -5,7 +5,7 @@ the surface; `extract_reference` evaluates the whole fine grid and serves the te
 no solid: the mesh is closed flat along the box.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +34,18 @@ class EmptySurfaceError(ValueError):
     """The field has no zero level set inside the domain."""
 
 
-def _axes(spacing: float) -> list[np.ndarray]:
+def _shape(spacing: float) -> list[int]:
+    """Points along each axis of the grid that covers the domain; it ends less than one `spacing` beyond it."""
     return [
-        np.float32(lower) + np.float32(spacing) * np.arange(round((upper - lower) / spacing) + 1, dtype=np.float32)
+        int(np.ceil((upper - lower) / spacing - 1e-5)) + 1
         for lower, upper in zip(DOMAIN_LOWER, DOMAIN_UPPER, strict=True)
+    ]
+
+
+def _axes(shape: Sequence[int], spacing: float) -> list[np.ndarray]:
+    return [
+        np.float32(lower) + np.float32(spacing) * np.arange(n, dtype=np.float32)
+        for lower, n in zip(DOMAIN_LOWER, shape, strict=True)
     ]
 
 
@@ -52,20 +60,18 @@ def extract(evaluate: Callable[[np.ndarray], np.ndarray], voxel: float) -> Extra
 
     `evaluate` maps points [3, n] to signed distances [n]. Raises EmptySurfaceError when there is no surface."""
     spacing = voxel * 2**_LEVELS
-    axes = _axes(spacing)
-    shape = [len(a) for a in axes]
-    values = evaluate(_points(axes, np.arange(np.prod(shape)))).reshape(shape)
+    shape = _shape(spacing)
+    values = evaluate(_points(_axes(shape, spacing), np.arange(np.prod(shape)))).reshape(shape)
     for _ in range(_LEVELS):
         values, spacing = _refine(evaluate, values, spacing)
-    return _mesh(values, spacing)
+    nx, ny, nz = _shape(voxel)
+    return _mesh(values[:nx, :ny, :nz], voxel)
 
 
 def extract_reference(evaluate: Callable[[np.ndarray], np.ndarray], voxel: float) -> ExtractedSurface:
     """`extract` with the field evaluated at every grid point."""
-    axes = _axes(voxel * 2**_LEVELS)
-    shape = [(len(a) - 1) * 2**_LEVELS + 1 for a in axes]
-    axes = [np.float32(a[0]) + np.float32(voxel) * np.arange(n, dtype=np.float32) for a, n in zip(axes, shape, strict=True)]
-    values = evaluate(_points(axes, np.arange(np.prod(shape)))).reshape(shape)
+    shape = _shape(voxel)
+    values = evaluate(_points(_axes(shape, voxel), np.arange(np.prod(shape)))).reshape(shape)
     return _mesh(values, voxel)
 
 
@@ -82,10 +88,7 @@ def _refine(evaluate, values: np.ndarray, spacing: float) -> tuple[np.ndarray, f
     new[::2, ::2, ::2] = False
     near = np.flatnonzero((new & (np.abs(fine) < _MARGIN * spacing * np.sqrt(3))).ravel())
     spacing /= 2
-    axes = [
-        np.float32(lower) + np.float32(spacing) * np.arange(n, dtype=np.float32)
-        for lower, n in zip(DOMAIN_LOWER, fine.shape, strict=True)
-    ]
+    axes = _axes(fine.shape, spacing)
     fine = np.ascontiguousarray(fine)
     if len(near):
         fine.ravel()[near] = evaluate(_points(axes, near))

@@ -3,6 +3,8 @@
 Rays start from a proxy (a mesh hit or a distance grid), so that the field itself is evaluated only a few times a ray.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,6 +20,12 @@ _MAXIMUM_STEP = 0.15
 _MINIMUM_SLOPE = 0.02
 
 
+def on_ray(origin, direction, t):
+    """Points o + t v [3, N] of rays at t [1, N]. In Dr.Jit 1.5 a plain product with an unevaluated tensor [1, 1] widens
+    that tensor itself, which a single ray would meet."""
+    return origin + dr.concat([t, t, t], axis=0) * direction
+
+
 def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
     """Moves ray parameters t [1, N] onto the field's surface: Newton steps along the ray whose slope ∇f·v is taken
     once, at the start, then improved by secants. `origin` and `direction` are [3, N].
@@ -25,13 +33,13 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
     Returns (t [1, N], f at t [1, N]); rays whose |f| stays above `HIT_TOLERANCE` have no hit near their start.
     Without gradients."""
     with dr.suspend_grad():
-        f, slope = signed_distance_and_slope(field, origin + t * direction, direction)
+        f, slope = signed_distance_and_slope(field, on_ray(origin, direction, t), direction)
         for _ in range(iterations):
             safe = dr.select(dr.abs(slope) < _MINIMUM_SLOPE, dr.copysign(_MINIMUM_SLOPE, slope), slope)
             step = dr.minimum(dr.maximum(-f / safe, -_MAXIMUM_STEP), _MAXIMUM_STEP)
             step = dr.select(dr.abs(f) < 0.1 * HIT_TOLERANCE, 0.0, step)
             t_new = t + step
-            f_new = signed_distance(field, origin + t_new * direction)
+            f_new = signed_distance(field, on_ray(origin, direction, t_new))
             secant = (f_new - f) / dr.select(step == 0.0, 1.0, step)
             slope = dr.select((step == 0.0) | (dr.abs(secant) < _MINIMUM_SLOPE), slope, secant)
             t, f = t_new, f_new
@@ -44,20 +52,21 @@ def bisection_hits_reference(field: SdfField, origin, direction, t_outside, t_in
     with dr.suspend_grad():
         for _ in range(iterations):
             middle = 0.5 * (t_outside + t_inside)
-            outside = signed_distance(field, origin + middle * direction) > 0
+            outside = signed_distance(field, on_ray(origin, direction, middle)) > 0
             t_outside = dr.select(outside, middle, t_outside)
             t_inside = dr.select(outside, t_inside, middle)
             dr.eval(t_outside, t_inside)
         return 0.5 * (t_outside + t_inside)
 
 
-def differentiable_hit(field: SdfField, origin, direction, t, slope):
-    """The hit o + t(θ) v with t(θ) = t₀ − (f(x₀; θ) − f(x₀; θ₀)) / (∇f·v) (IDR): the value of the exact hit, and the
-    derivative of the level set by the field's parameters. `slope` is ∇f·v [1, N], not differentiated."""
-    x = origin + t * direction
-    f = signed_distance(field, x)
+def differentiable_hit(field: SdfField, origin, direction, t):
+    """The hit o + t(θ) v with t(θ) = t₀ − (f(x₀; θ) − f(x₀; θ₀)) / (∇f·v) (IDR): the value [3, N] of the exact hit at t
+    [1, N], and the derivative of the level set by the field's parameters."""
+    x = on_ray(origin, direction, t)
+    f, slope = signed_distance_and_slope(field, x, direction)
+    slope = dr.detach(slope)
     safe = dr.select(dr.abs(slope) < _MINIMUM_SLOPE, dr.copysign(_MINIMUM_SLOPE, slope), slope)
-    return x - direction * ((f - dr.detach(f)) / dr.detach(safe))
+    return x - direction * ((f - dr.detach(f)) / safe)
 
 
 @dataclass(frozen=True)

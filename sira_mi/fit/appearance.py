@@ -37,6 +37,26 @@ class AppearanceProblem:
         self.target = np.ascontiguousarray(portrait.image[points["row"], points["column"]][keep].T, dtype=np.float32)
         self.z_l_prior = avatar.tensors["z_l"]
 
+    def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's to
+        the rendered mean radiance at the prior's albedo, as one factor for all channels."""
+        if stage.k_s[1] > 0 or "z_a" in stage.rates:
+            return {}
+        a = self.avatar.architecture
+        self.refresh(tensors)
+        index = np.random.default_rng(0).choice(self.target.shape[1], min(4096, self.target.shape[1]), replace=False)
+        x_ref, gamma, normal, view = self._columns(np.sort(index))
+        base = diffuse_albedo(self._network("diffuse_albedo", self._fixed, "z_a"), a.albedo_octaves, x_ref, gamma)
+        lobes = decode_lobes(self.avatar, self._fixed)
+        grey = dr.full(mi.TensorXf, 0.0, (1, len(index)))
+        diffuse, _ = physical_radiance(base, grey, normal, view, self.avatar.roughness, 0.0, lobes)
+        factor = self.target[:, index].mean() / max(float(diffuse.numpy().mean()), 1e-6)
+        return {"illumination": exposed(self.avatar, tensors["illumination"], factor)}
+
+    def _columns(self, index: np.ndarray) -> tuple:
+        names = ("x_ref", "gamma", "normal", "view")
+        return tuple(mi.TensorXf(np.ascontiguousarray(self.columns[k][:, index])) for k in names)
+
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Makes arrays of all tensors, those that the stage holds fixed included."""
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
@@ -46,9 +66,7 @@ class AppearanceProblem:
         current = {**self._fixed, **tensors}
         count = self.target.shape[1]
         index = np.sort(rng.choice(count, min(self.settings.pixels, count), replace=False))
-        x_ref, gamma, normal, view = (
-            mi.TensorXf(np.ascontiguousarray(self.columns[k][:, index])) for k in ("x_ref", "gamma", "normal", "view")
-        )
+        x_ref, gamma, normal, view = self._columns(index)
         target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
 
         share = step / max(stage.steps - 1, 1)
@@ -96,6 +114,15 @@ def decode_lobes(avatar: Avatar, tensors: dict):
     """The light [N_l, 7] of the illumination decoder at `tensors` (Floats)."""
     network = layers(avatar.architecture.networks["illumination"], tensors["illumination"])
     return illumination(network, mi.TensorXf(tensors["z_l"], (len(tensors["z_l"]), 1)))[:, :, 0]
+
+
+def exposed(avatar: Avatar, illumination_parameters: np.ndarray, factor: float) -> np.ndarray:
+    """Parameters of the illumination decoder whose lobes are brighter by about `factor`, by the bias of their
+    log-amplitudes."""
+    flat = illumination_parameters.copy()
+    bias = flat[-7 * avatar.architecture.lobes :].reshape(-1, 7)
+    bias[:, 4:7] += np.float32(np.log(max(factor, 1e-6)))
+    return flat
 
 
 def visible_points(portrait: Portrait, avatar_path: str, voxel: float) -> dict[str, np.ndarray]:

@@ -29,6 +29,9 @@ _CHECKPOINT_SECONDS = 10.0
 class Problem(Protocol):
     """What a stage optimises."""
 
+    def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Tensors that are set before the first step of a stage, by closed form rather than by descent."""
+
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Rebuilds whatever may lag behind the parameters; called every block and a function of `tensors` alone."""
 
@@ -90,6 +93,8 @@ def run_stages(
         while progress.stage < len(stages):
             make_problem, stage = stages[progress.stage]
             problem = make_problem(progress.tensors)
+            if progress.optimizer is None:
+                progress.tensors |= problem.start(stage, progress.tensors)
             optimizer = adam({k: progress.tensors[k] for k in stage.rates}, stage.rates, beta_2=0.98)
             if progress.optimizer:
                 restore_optimizer(optimizer, progress.optimizer)

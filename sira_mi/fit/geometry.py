@@ -46,11 +46,8 @@ class GeometryProblem:
         self.landmarks = self._landmarks(avatar)
 
     def _windows(self, size: int):
-        rows, columns = np.nonzero(self.valid & (self.portrait.mask > 0.05))
-        if len(rows) == 0:
-            rows, columns = np.nonzero(self.valid)
-        margin = 0.06 * max(np.ptp(rows), np.ptp(columns))
-        whole = (columns.min() - margin, rows.min() - margin, columns.max() + margin, rows.max() + margin)
+        rows, columns = np.nonzero(self.valid)
+        whole = (columns.min(), rows.min(), columns.max(), rows.max())
         known = self.portrait.landmarks[np.isfinite(self.portrait.landmarks).all(axis=1)]
         if len(known) == 0:
             return [window_around(*whole, size)]
@@ -95,6 +92,10 @@ class GeometryProblem:
             "weights": mi.TensorXf(weights[None] / weights.sum()),
             "face_size": float(np.ptp(pixels[1])),
         }
+
+    def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Nothing is known in closed form."""
+        return {}
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Extracts the mesh that rays start from at the current parameters."""

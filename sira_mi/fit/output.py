@@ -2,6 +2,8 @@
 
 Everything is written into one folder by functions that write under a temporary name first."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 
@@ -30,11 +32,12 @@ LAYERS = {
     "depth": (17, 1),
     "mask": (18, 1),
 }
-# The second light of the contact sheet: a warm key from the upper left, a cool rim from behind, a dim sky.
+# The second light of the contact sheet: a warm key from the upper left, a cool rim from behind, fill and a dim sky.
 SECOND_LIGHT = np.array(
     [
         [-0.75, 0.45, 0.5, 12.0, 4.6, 3.9, 3.1],
         [0.85, 0.3, -0.45, 10.0, 1.6, 2.2, 3.4],
+        [0.5, 0.0, 0.85, 2.0, 0.2, 0.2, 0.2],
         [0.0, 1.0, 0.1, 0.6, 0.16, 0.18, 0.22],
     ],
     np.float32,
@@ -130,6 +133,8 @@ def write_scene(path: Path, camera: Camera) -> None:
     <default name="height" value="{camera.height}"/>
     <default name="spp" value="16"/>
     <default name="voxel" value="0.05"/>
+    <!-- Albedos interpolated between vertices, without gradients: quick for path, ignored by sira_sg. -->
+    <default name="baked" value="true"/>
     <integrator type="$integrator"/>
     <sensor type="perspective">
         <string name="fov_axis" value="x"/>
@@ -154,10 +159,12 @@ def write_scene(path: Path, camera: Camera) -> None:
             <texture type="neural_albedo" name="diffuse_albedo">
                 <string name="avatar" value="$avatar"/>
                 <string name="kind" value="diffuse"/>
+                <boolean name="baked" value="$baked"/>
             </texture>
             <texture type="neural_albedo" name="specular_albedo">
                 <string name="avatar" value="$avatar"/>
                 <string name="kind" value="specular"/>
+                <boolean name="baked" value="$baked"/>
             </texture>
         </bsdf>
     </shape>

@@ -2,6 +2,8 @@
 
 It sees the images only, never the true albedo. Points enter through the frozen deformation of a trained SA-SM."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
@@ -11,7 +13,7 @@ import numpy as np
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, surface
+from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture
 from sira_mi.models.scenes import TrainingScene
@@ -28,13 +30,14 @@ class AppearanceTraining:
     steps: int = 4000
     scenes: int = 8  # scenes a step
     points: int = 512  # a scene and step
+    frozen_points: int = 6000  # of each scene's points, drawn once, at which the frozen deformation is evaluated
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
     latent_rate: float = 4e-3  # of the latents
     roughness: float = 0.5  # of skin (FLARE: 0.5 ± 0.1), fixed
     jitter: float = 0.03  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
     smoothness: float = 0.05  # λ7 (NeRFactor)
-    specular_anchor: float = 0.02  # pull of the specular albedo towards that of skin, which images hardly determine
+    specular_anchor: float = 0.2  # pull of the specular albedo towards that of skin, which images hardly determine
     skin_specular: float = 0.375  # mean specular albedo of skin (FLARE)
     white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
 
@@ -48,26 +51,45 @@ class FrozenScene:
     normals: np.ndarray  # [3, P] unit, of the field
     jittered_x_ref: np.ndarray  # [3, P] at x + ε
     jittered_gamma: np.ndarray  # [N_γ, P]
-    scene: TrainingScene
+    sample_point: np.ndarray  # [C] index of the point of observation c
+    sample_view: np.ndarray  # [3, C] unit direction from the camera to the point
+    sample_color: np.ndarray  # [3, C] linear radiance
 
 
 def freeze_scene(
-    architecture: AvatarArchitecture, shape: dict[str, np.ndarray], z_sdf: np.ndarray, scene: TrainingScene, jitter: float
+    architecture: AvatarArchitecture,
+    shape: dict[str, np.ndarray],
+    z_sdf: np.ndarray,
+    scene: TrainingScene,
+    settings: AppearanceTraining,
+    rng: np.random.Generator,
 ) -> FrozenScene:
-    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at a scene's points."""
+    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at points of a scene."""
     networks = architecture.networks
     field = SdfField(
         layers(networks["deformation"], mi.Float(shape["deformation"]), mi.TensorXf(z_sdf[:, None])),
         layers(networks["reference"], mi.Float(shape["reference"])),
         architecture.sdf_octaves,
     )
-    rng = np.random.default_rng(len(scene.points))
-    x = scene.points.T
-    moved = x + jitter * rng.standard_normal(x.shape).astype(np.float32)
+    count = len(scene.points)
+    chosen = np.sort(rng.choice(count, min(settings.frozen_points, count), replace=False))
+    x = scene.points[chosen].T
+    moved = x + settings.jitter * rng.standard_normal(x.shape).astype(np.float32)
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
-    _, _, jittered_x_ref, jittered_gamma = evaluate_in_chunks(lambda p: surface(field, p), moved)
-    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
-    return FrozenScene(x_ref, gamma, normals, jittered_x_ref, jittered_gamma, scene)
+    jittered_x_ref, jittered_gamma = evaluate_in_chunks(lambda p: deform(field, p), moved)
+    place = np.full(count, -1)
+    place[chosen] = np.arange(len(chosen))
+    samples = np.flatnonzero(place[scene.sample_point] >= 0)
+    return FrozenScene(
+        x_ref,
+        gamma,
+        gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6),
+        jittered_x_ref,
+        jittered_gamma,
+        place[scene.sample_point[samples]],
+        scene.views(samples).T,
+        scene.sample_color[samples].T,
+    )
 
 
 def initial_appearance_model(architecture: AvatarArchitecture, scenes: int, seed: int) -> dict:
@@ -105,12 +127,12 @@ def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.
     parts: dict[str, list] = {name: [] for name in (*names, "views", "colors")}
     for k in chosen:
         frozen = scenes[k]
-        samples = rng.integers(len(frozen.scene.sample_point), size=settings.points)
-        points = frozen.scene.sample_point[samples]
+        samples = rng.integers(len(frozen.sample_point), size=settings.points)
+        points = frozen.sample_point[samples]
         for name in names:
             parts[name].append(getattr(frozen, name)[:, points])
-        parts["views"].append(frozen.scene.views(samples).T)
-        parts["colors"].append(frozen.scene.sample_color[samples].T)
+        parts["views"].append(frozen.sample_view[:, samples])
+        parts["colors"].append(frozen.sample_color[:, samples])
     one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
     one_hot[chosen, np.arange(len(chosen))] = 1
     tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v, axis=1))) for k, v in parts.items()}

@@ -1,5 +1,7 @@
 """SA-SM, the shape and appearance model: auto-decoder training with the losses of eq. 7 (section 3.1.2)."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr

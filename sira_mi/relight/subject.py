@@ -1,0 +1,101 @@
+"""What is relit: an avatar, the camera that it was photographed by, and a light from a file."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.errors import InputError
+from sira_mi.models.avatar import Avatar, load_avatar
+from sira_mi.portrait.camera import Camera
+from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
+from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
+
+# Head and shoulders from the front, 1.2 m away: the camera where none is known.
+PORTRAIT_CAMERA = Camera(
+    K=np.array([[1317.0, 0.0, 256.0], [0.0, 1317.0, 256.0], [0.0, 0.0, 1.0]]),
+    world_to_camera=np.array([[1.0, 0, 0, 0], [0, -1, 0, -0.4], [0, 0, -1, 12], [0, 0, 0, 1]]),
+    width=512,
+    height=512,
+)
+_MAXIMUM_REPORT_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """An avatar file and a camera."""
+
+    path: Path
+    avatar: Avatar
+    camera: Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """An environment: `lobes` [N_l, 7], or an `image` [H, W, 3] of linear radiance, or both, the lobes fitted to the
+    image."""
+
+    lobes: np.ndarray | None
+    image: np.ndarray | None = None
+
+    def turned(self, rotation: np.ndarray) -> dict:
+        """The emitter for `mi.load_dict`, turned by `rotation` [3, 3]: `envmap` of the image if there is one, else
+        `sg_envmap`."""
+        if self.image is not None:
+            to_world = np.eye(4)
+            to_world[:3, :3] = rotation
+            return {"type": "envmap", "bitmap": mi.Bitmap(self.image), "to_world": mi.ScalarTransform4f(to_world)}
+        lobes = self.lobes.copy()
+        lobes[:, :3] = lobes[:, :3] @ rotation.T
+        return {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)}
+
+
+def read_subject(path: Path, size: int | None = None) -> Subject:
+    """The avatar of a fit's output folder or of an `avatar.safetensors`, and the camera in the `avatar.json` beside it,
+    or else `PORTRAIT_CAMERA`; scaled so that its longer side has `size` pixels.
+
+    Raises InputError for a file that is missing, damaged or of another kind."""
+    file = path / "avatar.safetensors" if path.is_dir() else path
+    if not file.is_file():
+        what = f"{path} holds no avatar.safetensors" if path.is_dir() else f"{path} does not exist"
+        raise InputError(f"{what}; give the output folder of a fit, or an avatar.safetensors")
+    avatar = load_avatar(file)
+    report = file.with_name("avatar.json")
+    camera = _read_camera(report) if report.is_file() else PORTRAIT_CAMERA
+    if size is not None:
+        longer = max(camera.width, camera.height)
+        width, height = (max(1, round(side * size / longer)) for side in (camera.width, camera.height))
+        camera = camera.scaled(width / camera.width, height / camera.height, width, height)
+    return Subject(file, avatar, camera)
+
+
+def _read_camera(report: Path) -> Camera:
+    try:
+        if report.stat().st_size > _MAXIMUM_REPORT_BYTES:
+            raise InputError(f"{report} is larger than any report of a fit")
+        data = json.loads(report.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {report}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{report} is damaged, not JSON: {error}") from error
+    if not isinstance(data, dict) or "camera" not in data:
+        raise InputError(f"{report} holds no camera; without that file, a portrait camera is used")
+    return Camera.from_dict(data["camera"], f"the camera in {report}")
+
+
+def read_light(path: Path | None, avatar: Avatar, lobes: bool, count: int = 64) -> Light:
+    """The light of a `.json` or `.exr` file; without one, the avatar's own, which the fit found in the photo. An `.exr`
+    is taken as it is, or, where `lobes` are asked for, `count` of them are fitted to it.
+
+    Raises InputError for a file that is missing, damaged or of another kind."""
+    if path is None:
+        return Light(check_lobes(avatar.tensors["lobes"], "the light of the avatar"))
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return Light(read_lights(path))
+    if suffix != ".exr":
+        raise InputError(f"{path}: lights are .json (lobes) or .exr (latitude-longitude environment) files")
+    image = read_environment(path)
+    return Light(fit_environment(image, EnvironmentFit(lobes=count))) if lobes else Light(None, image)
