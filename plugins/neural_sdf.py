@@ -61,7 +61,8 @@ class NeuralSDF(mi.Mesh):
 
     Geometry must be changed through the *scene's* parameters (`mi.traverse(scene)`), and `params.update()` be called
     after gradients are enabled. The shape has no UVs, is not an emitter with a stable area measure, and where it meets
-    the domain box it is closed flat, without gradients.
+    the domain box it is closed flat, without gradients. When a scene is loaded, Mitsuba merges meshes whose BSDFs are
+    equal into one, which takes a head's parameters away: give it a BSDF of its own, or load with `optimize=False`.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.1; implicit differentiation as in IDR (Yariv et al. 2020).
 
@@ -143,6 +144,13 @@ class NeuralSDF(mi.Mesh):
                 return result
         field = self.field()
         result = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), *columns)
+        stray = np.flatnonzero(np.abs(result[1][0]) >= tracing.HIT_TOLERANCE)
+        if len(stray):
+            o, d, start = (c[:, stray] for c in columns)
+            (t,) = evaluate_in_chunks(lambda o, d, t: tracing.first_crossings(field, o, d, t), o, d, start)
+            found = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), o, d, np.minimum(t, 1e4))
+            for whole, part in zip(result, found, strict=True):
+                whole[:, stray] = part
         self._last_hits = (columns, parameters, result) if columns[2].size <= CHUNK else None
         return result
 

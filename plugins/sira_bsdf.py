@@ -88,63 +88,66 @@ class SiraBSDF(mi.BSDF):
         glossy = mi.Bool(ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))
         return glossy & active, mi.Bool(ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)) & active
 
-    def _glossy_share(self, ctx, si, active):
+    def _albedos(self, si, active):
+        """Diffuse and specular albedo; networks may stand behind them, so each is asked once a call."""
+        return self.diffuse_albedo.eval(si, active), self.specular_albedo.eval_1(si, active)
+
+    def _glossy_share(self, ctx, si, albedos):
         """Probability of sampling the specular lobe, by a rough estimate of the two albedos; detached."""
         with dr.suspend_grad():
-            diffuse = dr.mean(self.diffuse_albedo.eval(si, active))
-            weight = self.k_s * brdf.fresnel(self.specular_albedo.eval_1(si, active), mi.Frame3f.cos_theta(si.wi))
-            share = dr.clip(weight / dr.maximum(weight + diffuse, 1e-6), 0.1, 0.9)
+            weight = self.k_s * brdf.fresnel(albedos[1], mi.Frame3f.cos_theta(si.wi))
+            share = dr.clip(weight / dr.maximum(weight + dr.mean(albedos[0]), 1e-6), 0.1, 0.9)
             if not ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1):
                 share = mi.Float(1.0)
             if not ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0):
                 share = mi.Float(0.0)
             return share
 
-    def _value(self, ctx, si, wo, active):
+    def _value(self, ctx, si, wo, albedos, active):
         """f · cos of the light direction."""
         cos_light = mi.Frame3f.cos_theta(wo)
         active = active & ((mi.Frame3f.cos_theta(si.wi) > 0.0) & (cos_light > 0.0))
         glossy, diffuse = self._components(ctx, active)
-        specular = brdf.specular_brdf(
-            mi.Vector3f(0, 0, 1), si.wi, wo, self.specular_albedo.eval_1(si, active), self.roughness
-        )
-        value = dr.select(diffuse, self.diffuse_albedo.eval(si, active) * dr.inv_pi, 0.0)
+        specular = brdf.specular_brdf(mi.Vector3f(0, 0, 1), si.wi, wo, albedos[1], self.roughness)
+        value = dr.select(diffuse, albedos[0] * dr.inv_pi, 0.0)
         return dr.select(active, (value + dr.select(glossy, self.k_s * specular, 0.0)) * cos_light, 0.0)
 
-    def _density(self, ctx, si, wo, active):
+    def _density(self, si, wo, share, active):
         with dr.suspend_grad():
             active = active & ((mi.Frame3f.cos_theta(si.wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0))
             glossy = brdf.reflected_density(mi.Vector3f(0, 0, 1), si.wi, wo, self.roughness)
-            share = self._glossy_share(ctx, si, active)
             return dr.select(active, dr.lerp(mi.warp.square_to_cosine_hemisphere_pdf(wo), glossy, share), 0.0)
 
     def sample(self, ctx, si, sample1, sample2, active=True):
         active = active & (mi.Frame3f.cos_theta(si.wi) > 0.0)
-        share = self._glossy_share(ctx, si, active)
+        albedos = self._albedos(si, active)
+        share = self._glossy_share(ctx, si, albedos)
         glossy = sample1 < share
         with dr.suspend_grad():
             half = brdf.sample_distribution(sample2, self.roughness)
             wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
         bs = dr.zeros(mi.BSDFSample3f)
         bs.wo = wo
-        bs.pdf = self._density(ctx, si, wo, active)
+        bs.pdf = self._density(si, wo, share, active)
         bs.eta = 1.0
         bs.sampled_component = dr.select(glossy, mi.UInt32(0), mi.UInt32(1))
         bs.sampled_type = dr.select(
             glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
         )
         active = active & (bs.pdf > 0.0)
-        value = self._value(ctx, si, wo, active) / dr.select(active, bs.pdf, 1.0)
+        value = self._value(ctx, si, wo, albedos, active) / dr.select(active, bs.pdf, 1.0)
         return bs, dr.select(active, value, 0.0)
 
     def eval(self, ctx, si, wo, active=True):
-        return self._value(ctx, si, wo, active)
+        return self._value(ctx, si, wo, self._albedos(si, active), active)
 
     def pdf(self, ctx, si, wo, active=True):
-        return self._density(ctx, si, wo, active)
+        return self._density(si, wo, self._glossy_share(ctx, si, self._albedos(si, active)), active)
 
     def eval_pdf(self, ctx, si, wo, active=True):
-        return self._value(ctx, si, wo, active), self._density(ctx, si, wo, active)
+        albedos = self._albedos(si, active)
+        share = self._glossy_share(ctx, si, albedos)
+        return self._value(ctx, si, wo, albedos, active), self._density(si, wo, share, active)
 
     def eval_diffuse_reflectance(self, si, active=True):
         return self.diffuse_albedo.eval(si, active) & active

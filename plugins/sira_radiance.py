@@ -6,13 +6,15 @@ from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import normalised, signed_distance, surface
-from sira_mi.fields.tracing import closest_approach, differentiable_hit
+from sira_mi.fields.tracing import closest_approach, differentiable_hit, refined_approach
 from sira_mi.models.avatar import load_avatar
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
 # The closest approach that a ray outside the domain box is given, in scene units.
 FAR = 1.0
+# Rays that come this close to the surface, in scene units, decide the mask.
+OUTLINE = 0.3
 
 
 class SiraRadiance(mi.SamplingIntegrator):
@@ -106,11 +108,18 @@ class SiraRadiance(mi.SamplingIntegrator):
 
     @staticmethod
     def _closest(head: NeuralSDF, field, local, active, width: int):
-        """min f along the rays (Float): located on the shape's distance grid, evaluated on the field."""
+        """min f along the rays (Float): located on the shape's distance grid, where it decides the mask also on the
+        field, and evaluated on the field."""
         box = mi.BoundingBox3f(mi.Point3f(*DOMAIN_LOWER), mi.Point3f(*DOMAIN_UPPER))
         inside, near, far = box.ray_intersect(local)
         inside &= active
-        t = closest_approach(head.grid, local.o, local.d, dr.maximum(near, 0.0), far, inside)
+        near = dr.maximum(near, 0.0)
+        t = closest_approach(head.grid, local.o, local.d, near, far, inside)
+        outline = dr.compress(inside & (dr.abs(head.grid(local.o + t * local.d, inside)) < OUTLINE))
+        if dr.width(outline) > 0:
+            columns = (to_columns(dr.gather(type(a), a, outline)) for a in (local.o, local.d, t))
+            dr.scatter(t, from_columns(refined_approach(field, *columns, head.voxel), mi.Float), outline)
+            t = dr.clip(t, near, far)
         index = dr.compress(inside)
         closest = dr.full(mi.Float, FAR, width)
         if dr.width(index) > 0:

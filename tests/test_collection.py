@@ -269,6 +269,28 @@ def test_scenes_repeat_bit_for_bit(arrays, hair_folder):
         assert np.array_equal(arrays[name], again[name]), name
 
 
+def test_pixels_do_not_depend_on_the_order_of_threads(variant):
+    """Sums of samples run in a fixed order: float32 images are equal to the last bit, and coverage is what the mask of
+    a sphere must be."""
+    unit, triangles = surface.unit_eye()
+    part = render.Part(
+        unit, triangles, unit, np.full(unit.shape, 0.5), np.full(len(unit), 0.4), np.zeros(len(triangles))
+    )
+    settings = render.RenderSettings(size=96, samples=16)
+    drawn = render.build_scene([part], np.ones((16, 32, 3)), settings)
+    cameras = render.sample_cameras(np.random.default_rng(0), settings.size)
+    images, coverage = render.render_views(drawn, *cameras, settings, 1)
+    for _ in range(3):
+        again, _ = render.render_views(drawn, *cameras, settings, 1)
+        assert np.array_equal(images, again)
+    for cover, intrinsic, pose in zip(coverage, *cameras, strict=True):
+        pixel, depth = render.project(np.zeros((1, 3)), intrinsic, pose)
+        radius = intrinsic[0, 0] / np.sqrt(depth[0] ** 2 - 1)
+        assert cover.sum() == pytest.approx(np.pi * radius**2, rel=0.04)
+        y, x = np.nonzero(cover > 0.5)
+        assert np.abs([x.mean() + 0.5, y.mean() + 0.5] - pixel[0]).max() < 0.5
+
+
 def test_landmarks_sit_on_the_surface_where_they_belong():
     """Nose tip, eye corners, mouth corners and chin, checked against the topology's own regions."""
     control = makehuman.identity_vertices(random_identity(5))

@@ -142,15 +142,15 @@ def test_a_ray_outside_the_box_is_far(avatar, avatar_path):
 def test_colour_derivatives_by_the_shape(radiance, radiance_image, key):
     weight = weights(6) * interior(radiance_image[:, :, 3])[:, :, None]
     weight[:, :, 3:] = 0
-    check(radiance, key, weight)
+    check(radiance, key, weight, change=3e-4)
 
 
 @pytest.mark.parametrize("key", ["head.z_sdf", "head.deformation", "head.reference"])
 def test_silhouette_derivatives_by_the_closest_approach(radiance, radiance_image, key):
     weight = np.zeros((SIZE, SIZE, 6), np.float32)
     closest = radiance_image[:, :, 5]
-    weight[:, :, 5] = weights(1)[:, :, 0] * (np.abs(closest) < 0.15)
-    assert (weight > 0).sum() > 30
+    weight[:, :, 5] = weights(1)[:, :, 0] * (np.abs(closest) < 0.15) * np.sign(closest)  # no cancellation
+    assert (weight != 0).sum() > 30
     check(radiance, key, weight, tolerance=2e-3)
 
 
@@ -292,7 +292,7 @@ def test_normals_are_world_normals_of_a_turned_head(avatar, avatar_path, shaded_
 def test_derivatives_of_the_closed_form(shaded, shaded_image, key):
     weight = weights(19) * interior(shaded_image[:, :, 18])[:, :, None]
     weight[:, :, 3:] = 0
-    check(shaded, key, weight)
+    check(shaded, key, weight, change=3e-4 if key == "head.z_sdf" else 2e-3)
 
 
 def test_pictures_and_derivatives_repeat_bit_for_bit(avatar, avatar_path):

@@ -7,7 +7,7 @@ import numpy as np
 from sira_mi.collection.makehuman import Identity
 
 # Mean melanin of `makehuman.ANCESTRIES`.
-MELANIN = np.array([0.78, 0.3, 0.13])
+MELANIN = np.array([0.7, 0.2, 0.08])
 
 HAIR_COLOURS = {
     "black": (0.012, 0.010, 0.009),
@@ -59,7 +59,7 @@ class Look:
 def sample_look(random: np.random.Generator, identity: Identity, has_hair: bool) -> Look:
     """Colours and details that go with an identity's age, sex and ancestry."""
     share = np.array(identity.ancestry)
-    melanin = float(np.clip(share @ MELANIN + random.normal(0, 0.11), 0, 1))
+    melanin = float(np.clip(share @ MELANIN + random.normal(0, 0.1), 0, 1))
     hair_name = _hair_name(random, identity)
     spread = np.exp(random.normal(0, 0.18) + random.normal(0, 0.05, 3))
     light_eyes = share[2] * 0.75

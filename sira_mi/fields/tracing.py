@@ -18,6 +18,9 @@ from sira_mi.fields.sdf import SdfField, signed_distance, signed_distance_and_sl
 HIT_TOLERANCE = 1e-4
 _MAXIMUM_STEP = 0.15
 _MINIMUM_SLOPE = 0.02
+# The search of `first_crossings`, in scene units along the ray from the proxy's hit.
+_SEARCH_START, _SEARCH_STEP, _SEARCH_SAMPLES = -0.24, 0.03, 64
+_NO_CROSSING = 1e9
 
 
 def on_ray(origin, direction, t):
@@ -45,6 +48,24 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
             t, f = t_new, f_new
             dr.eval(t, f, slope)
         return t, f
+
+
+def first_crossings(field: SdfField, origin, direction, t):
+    """For rays that Newton steps did not bring onto the surface: the first change from outside to inside on even samples
+    from a little before t [1, N] to well behind it, as a linear estimate [1, N]; `_NO_CROSSING` where there is none.
+
+    Without gradients."""
+    with dr.suspend_grad():
+        found = dr.full(mi.TensorXf, _NO_CROSSING, t.shape)
+        before = dr.full(mi.TensorXf, -1.0, t.shape)
+        for k in range(_SEARCH_SAMPLES):
+            here = t + (_SEARCH_START + k * _SEARCH_STEP)
+            f = signed_distance(field, on_ray(origin, direction, here))
+            enters = (before > 0) & (f <= 0) & (found == _NO_CROSSING)
+            found = dr.select(enters, here - _SEARCH_STEP * f / (f - before), found)
+            before = f
+            dr.eval(found, before)
+        return found
 
 
 def bisection_hits_reference(field: SdfField, origin, direction, t_outside, t_inside, iterations: int = 40):
@@ -124,3 +145,13 @@ def closest_approach(grid: DistanceGrid, origin, direction, t_near, t_far, activ
     t, step = smallest(t_near, t_far)
     t, _ = smallest(dr.maximum(t - step, t_near), dr.minimum(t + step, t_far))
     return t
+
+
+def refined_approach(field: SdfField, origin, direction, t, step: float):
+    """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and `step` to
+    either side, scene units, moved by no more than that. Rays are [3, N]. Without gradients."""
+    with dr.suspend_grad():
+        behind, middle, ahead = (signed_distance(field, on_ray(origin, direction, t + k * step)) for k in (-1, 0, 1))
+        curvature = dr.maximum(behind - 2.0 * middle + ahead, 1e-6)
+        shift = 0.5 * step * (behind - ahead) / curvature
+        return t + dr.minimum(dr.maximum(shift, -step), step)

@@ -134,7 +134,16 @@ def save_avatar(path: str | Path, avatar: Avatar) -> None:
     }
     tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
     data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
+    data = _with_sorted_header(data)
     write_through(path, lambda file: file.write_bytes(data))
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """The same safetensors file, its header in a fixed order: the library writes metadata in an order that varies."""
+    size = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + data[size:]
 
 
 def load_avatar(path: str | Path | None = None) -> Avatar:
@@ -150,9 +159,10 @@ def load_avatar(path: str | Path | None = None) -> Avatar:
             if metadata.get("format") != FORMAT:
                 raise InputError(f"{path} is not an avatar of this version ({FORMAT}); fit the photo again")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
-    except OSError as error:
-        raise InputError(f"cannot read the avatar {path}: {error.strerror or error}") from error
-    except SafetensorError as error:
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot read the avatar {path}: {reason}") from error
+    except (SafetensorError, TypeError) as error:
         raise InputError(f"{path} is damaged or not a safetensors file: {error}") from error
     try:
         description = json.loads(metadata["avatar"])
@@ -170,8 +180,8 @@ def _check(avatar: Avatar) -> None:
     architecture, tensors = avatar.architecture, avatar.tensors
     due = {name: (network.parameters,) for name, network in architecture.networks.items()}
     due |= {name: (size,) for name, size in architecture.latents.items()}
-    due |= {"lobes": (tensors["lobes"].shape[0], 7), "landmarks": (LANDMARKS, 3)}
-    if not 0 < due["lobes"][0] <= _MAXIMUM_LOBES:
+    due |= {"lobes": (*tensors["lobes"].shape[:1], 7), "landmarks": (LANDMARKS, 3)}
+    if not 0 < tensors["lobes"].size <= 7 * _MAXIMUM_LOBES:
         raise ValueError(f"between 1 and {_MAXIMUM_LOBES} lobes expected")
     for name, shape in due.items():
         tensor = tensors[name]

@@ -23,11 +23,11 @@ LATENTS = ("z_sdf", "z_r")
 class ShapeTraining:
     """Settings of the SA-SM training; λ as in eq. 7."""
 
-    steps: int = 6000
+    steps: int = 4000
     scenes: int = 8  # scenes a step
-    surface_points: int = 512  # a scene and step
-    volume_points: int = 192  # a scene and step
-    landmarks: int = 64  # a scene and step
+    surface_points: int = 384  # a scene and step
+    volume_points: int = 128  # a scene and step
+    landmarks: int = 48  # a scene and step
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
     latent_rate: float = 4e-3  # of the latents
     initial_radius: float = 1.4  # of the reference sphere, scene units
