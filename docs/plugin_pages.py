@@ -8,7 +8,13 @@ import textwrap
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-_KINDS = {"BSDF": "BSDF", "Emitter": "Emitter", "Mesh": "Shape", "SamplingIntegrator": "Integrator", "Texture": "Texture"}
+_KINDS = {
+    "BSDF": "BSDF",
+    "Emitter": "Emitter",
+    "Mesh": "Shape",
+    "SamplingIntegrator": "Integrator",
+    "Texture": "Texture",
+}
 
 
 def plugin_docstring(source: str) -> tuple[str, str]:

@@ -1,6 +1,7 @@
 import drjit as dr
 import mitsuba as mi
 
+from sira_mi.errors import InputError
 from sira_mi.fields.appearance import (
     albedo_refinement,
     albedo_refinement_cooperative,
@@ -84,6 +85,8 @@ class NeuralAlbedo(mi.Texture):
 
     def __init__(self, props):
         super().__init__(props)
+        if mi.is_spectral or mi.is_polarized:
+            raise InputError("neural_albedo works in RGB and monochrome variants, such as llvm_ad_rgb")
         avatar = load_avatar(find_avatar(props))
         self.baked = bool(props.get("baked", False))
         self.changed = False  # since a baked texture was last baked
@@ -164,11 +167,11 @@ class NeuralAlbedo(mi.Texture):
         return list(si.shape.eval_attribute_3(self._attribute, si))
 
     def eval(self, si, active=True):
-        albedo = self._evaluate(si)
-        return mi.Color3f(*albedo if len(albedo) == 3 else albedo * 3) & active
+        return mi.Spectrum(self.eval_1(si, active)) if mi.is_monochromatic else self.eval_3(si, active)
 
     def eval_3(self, si, active=True):
-        return self.eval(si, active)
+        albedo = self._evaluate(si)
+        return mi.Color3f(*albedo if len(albedo) == 3 else albedo * 3) & active
 
     def eval_1(self, si, active=True):
         albedo = self._evaluate(si)

@@ -1,6 +1,7 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 from sira_mi.fields import tracing
 from sira_mi.fields.columns import scatter_columns, to_columns
@@ -8,7 +9,6 @@ from sira_mi.fields.extraction import extract
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, signed_distance, surface
 from sira_mi.models.avatar import load_avatar
-from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 _FIELD_KEYS = ("deformation", "reference", "z_sdf")
 
@@ -134,8 +134,8 @@ class NeuralSDF(mi.Mesh):
         return scatter_columns(mi.TensorXf(exact), index, width, mi.Float), hit
 
     def _newton(self, columns: list[np.ndarray]) -> list[np.ndarray]:
-        """Newton hits of rays [3, N], [3, N] from [1, N]. The last result is kept: `mi.render` traces the same rays once
-        for the picture and once more for its derivative."""
+        """Newton hits of rays [3, N], [3, N] from [1, N]. The last result is kept: `mi.render` traces the same rays
+        once for the picture and once more for its derivative."""
         parameters = tuple(dr.detach(getattr(self, key)) for key in _FIELD_KEYS)
         if self._last_hits is not None:
             rays, then, result = self._last_hits
@@ -256,8 +256,8 @@ def find_head(scene, integrator: str) -> NeuralSDF:
 
 
 def trace_head(scene, head: NeuralSDF, ray, active):
-    """Exact hits of `ray` on the head: (t, whether the head is hit and nothing else lies before it). Rays that graze the
-    mesh without meeting the field miss."""
+    """Exact hits of `ray` on the head: (t, whether the head is hit and nothing else lies before it). Rays that
+    graze the mesh without meeting the field miss."""
     with dr.suspend_grad():
         proxy = scene.ray_intersect_preliminary(ray, True, active)
         on_head = active & proxy.is_valid() & (proxy.shape == mi.ShapePtr(head))

@@ -1,15 +1,15 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from sira_mi.plugins.neural_albedo import NeuralAlbedo
+from sira_mi.plugins.neural_sdf import find_head, trace_head
+from sira_mi.plugins.sg_envmap import SGEnvmap
+from sira_mi.plugins.sira_bsdf import SiraBSDF
 
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.sdf import evaluate_in_chunks, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.models.af_sm import physical_radiance
-from sira_mi.plugins.neural_albedo import NeuralAlbedo
-from sira_mi.plugins.neural_sdf import find_head, trace_head
-from sira_mi.plugins.sg_envmap import SGEnvmap
-from sira_mi.plugins.sira_bsdf import SiraBSDF
 
 # Rows of the columns that are computed at a hit, in order.
 _ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}
@@ -30,16 +30,16 @@ class SiraSG(mi.SamplingIntegrator):
 
     Eq. 8 in closed form: the radiance that a `neural_sdf` with a `sira_bsdf` reflects under an `sg_envmap`, without
     sampling and without noise, but also without shadows and interreflections; `path` renders the same scene with both.
-    Albedos that are `neural_albedo` textures are evaluated as networks in tensor mode; any other texture is asked at the
-    hit. Other shapes only occlude.
+    Albedos that are `neural_albedo` textures are evaluated as networks in tensor mode; any other texture is asked at
+    the hit. Other shapes only occlude.
 
     Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s), `diffuse_albedo.RGB`, `specular_albedo`,
-    `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene units) and
-    `mask` (1 on the head). All are zero off the head.
+    `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene
+    units) and `mask` (1 on the head). All are zero off the head.
 
-    Hits are exact. Differentiable in everything that the scene exposes: lobes, albedo networks and latents, k_s and k_r,
-    and, through implicit differentiation, the shape's latent and networks (interior derivatives; for silhouettes see
-    `sira_radiance` and the stock projective integrators). Cannot be nested in symbolic code.
+    Hits are exact. Differentiable in everything that the scene exposes: lobes, albedo networks and latents, k_s and
+    k_r, and, through implicit differentiation, the shape's latent and networks (interior derivatives; for silhouettes
+    see `sira_radiance` and the stock projective integrators). Cannot be nested in symbolic code.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.3; PhySG (Zhang et al. 2021).
 
@@ -106,7 +106,8 @@ class SiraSG(mi.SamplingIntegrator):
                 return texture.evaluate_columns(x_ref, gamma)[0:rows, :]
             si = dr.zeros(mi.SurfaceInteraction3f, x.shape[1])
             si.p = head.to_world @ from_columns(x, mi.Point3f)
-            return to_columns(texture.eval(si) if rows == 3 else texture.eval_1(si))
+            value = texture.eval(si) if rows == 3 else texture.eval_1(si)
+            return to_columns(value + dr.zeros(mi.Float, x.shape[1]))
 
         def columns(x, direction):
             _, gradient, x_ref, gamma = surface(field, x)

@@ -21,7 +21,9 @@ def write_through(path: str | Path, write: Callable[[Path], None]) -> None:
         write(temporary)
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror or error}; choose another place or free some") from error
+        raise InputError(
+            f"cannot write {path}: {error.strerror or error}; choose another place or free some"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -68,7 +68,9 @@ def train_appearance(collection: Path, out: Path, steps: int | None, seed: int) 
     if shape["z_sdf"].shape[1] != len(scenes):
         raise InputError(f"{out} was trained on {shape['z_sdf'].shape[1]} scenes, {collection} has {len(scenes)}")
     frozen = [
-        af_sm.freeze_scene(architecture, shape, shape["z_sdf"][:, k], scene, settings, np.random.default_rng([seed, 5, k]))
+        af_sm.freeze_scene(
+            architecture, shape, shape["z_sdf"][:, k], scene, settings, np.random.default_rng([seed, 5, k])
+        )
         for k, scene in enumerate(scenes)
     ]
     initial = af_sm.initial_appearance_model(architecture, len(scenes), seed)
@@ -78,11 +80,11 @@ def train_appearance(collection: Path, out: Path, steps: int | None, seed: int) 
         batch = af_sm.draw_batch(frozen, settings, np.random.default_rng([seed, 3, number]))
         return af_sm.training_step(architecture, settings, optimizer, batch)
 
-    appearance = run_training(
-        out, "appearance", settings.steps, optimizer, lambda k: af_sm.rates(settings, k), step
-    )
+    appearance = run_training(out, "appearance", settings.steps, optimizer, lambda k: af_sm.rates(settings, k), step)
     landmarks = np.stack([scene.landmarks for scene in scenes])
-    save_avatar(out / "prior.safetensors", assemble_prior(architecture, shape, appearance, landmarks, settings.roughness, seed))
+    save_avatar(
+        out / "prior.safetensors", assemble_prior(architecture, shape, appearance, landmarks, settings.roughness, seed)
+    )
 
 
 if __name__ == "__main__":

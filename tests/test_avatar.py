@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,13 +57,15 @@ def test_replaced_leaves_the_original_alone(avatar):
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
 def test_truncated_files(avatar_path, tmp_path, share):
-    data = open(avatar_path, "rb").read()
+    data = Path(avatar_path).read_bytes()
     path = tmp_path / "cut.safetensors"
     path.write_bytes(data[: int(share * len(data))])
     complaint(path)
 
 
-@pytest.mark.parametrize("data", [b"not a tensor file at all", b"\xff" * 64, b"\x89PNG\r\n\x1a\n" + bytes(200), bytes(8)])
+@pytest.mark.parametrize(
+    "data", [b"not a tensor file at all", b"\xff" * 64, b"\x89PNG\r\n\x1a\n" + bytes(200), bytes(8)]
+)
 def test_files_of_other_kinds(tmp_path, data):
     path = tmp_path / "photo.png"
     path.write_bytes(data)

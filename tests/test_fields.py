@@ -358,6 +358,19 @@ def test_newton_steps_reach_the_bisected_hit_from_two_millimetres_off(avatar, of
     assert np.abs(f.numpy()).max() < tracing.HIT_TOLERANCE
 
 
+def test_sampled_crossings_lie_at_the_bisected_hits(avatar):
+    """From starts too far off for Newton steps; a ray that passes by has none."""
+    field = head_field(avatar)
+    origin, direction = rays_at_head(200)
+    exact = exact_hits(field, origin, direction).numpy()
+    early = np.random.default_rng(0).uniform(0.05, 0.15, exact.shape).astype(np.float32)
+    o, d = mi.TensorXf(origin), mi.TensorXf(direction)
+    found = tracing.first_crossings(field, o, d, mi.TensorXf(exact - early)).numpy()
+    assert np.abs(found - exact).max() < 5e-3
+    away = tracing.first_crossings(field, o, mi.TensorXf(-direction), mi.TensorXf(exact)).numpy()
+    assert not (np.abs(away - exact) < 5).any()
+
+
 def test_a_ray_that_misses_is_not_a_hit(avatar):
     origin, direction = np.array([[3.0], [0], [5]], np.float32), np.array([[0.0], [0], [-1]], np.float32)
     t = mi.TensorXf(np.array([[5.0]], np.float32))

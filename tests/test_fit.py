@@ -29,9 +29,7 @@ TINY = fit_settings.FitSettings(
     pixels=256,
     voxel=0.16,
     final_voxel=0.12,
-    stages=tuple(
-        (kind, dataclasses.replace(stage, steps=6)) for kind, stage in fit_settings.QUALITIES["draft"].stages
-    ),
+    stages=tuple((kind, dataclasses.replace(stage, steps=6)) for kind, stage in fit_settings.QUALITIES["draft"].stages),
     block=3,
 )
 
@@ -217,7 +215,12 @@ def workshop(tmp_path_factory):
     Image.new("L", (256, 256)).save(folder / "black.png")
     (folder / "text.png").write_text("this is no image")
     save_file({"x": np.zeros(3, np.float32)}, folder / "foreign.safetensors")
-    away = {"K": [[400, 0, 128], [0, 400, 128], [0, 0, 1]], "world_to_camera": np.eye(4).tolist(), "width": 256, "height": 256}
+    away = {
+        "K": [[400, 0, 128], [0, 400, 128], [0, 0, 1]],
+        "world_to_camera": np.eye(4).tolist(),
+        "width": 256,
+        "height": 256,
+    }
     (folder / "away.json").write_text(json.dumps(away))
     return folder
 

@@ -91,7 +91,7 @@ def test_a_head_moved_turned_and_scaled_is_the_same_head_from_a_moved_camera(ava
     assert np.abs(a - b).mean() < 5e-3
     assert np.abs(a[:, :, 3].sum() - b[:, :, 3].sum()) / a[:, :, 3].sum() < 2e-3
     head = head_of(turned)
-    local = np.array((head.to_local @ mi.Point3f(positions(head).T)))
+    local = np.array(head.to_local @ mi.Point3f(positions(head).T))
     np.testing.assert_allclose(local, head.vertices(), atol=2e-5)
 
 
@@ -131,7 +131,7 @@ def check_image_derivatives(avatar, scene, spp: int, change: float, tolerance: f
             return float(dr.mean(image[:, :, :3] * weight, axis=None).numpy().item())
 
         results[key] = slopes(loss, avatar.tensors[key], dr.grad(values[key]).numpy(), change)
-    for key, (ad, difference) in results.items():
+    for ad, difference in results.values():
         assert ad == pytest.approx(difference, rel=tolerance), results
 
 
@@ -267,7 +267,12 @@ def test_a_nested_albedo_follows_the_shape(avatar, avatar_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"voxel": 0.0}, "voxel"), ({"voxel": 2.0}, "voxel"), ({"voxel": float("nan")}, "voxel"), ({"remesh_every": 0}, "remesh")],
+    [
+        ({"voxel": 0.0}, "voxel"),
+        ({"voxel": 2.0}, "voxel"),
+        ({"voxel": float("nan")}, "voxel"),
+        ({"remesh_every": 0}, "remesh"),
+    ],
 )
 def test_bad_properties_are_named(avatar_path, options, message):
     with pytest.raises(Exception, match=message):
@@ -275,7 +280,7 @@ def test_bad_properties_are_named(avatar_path, options, message):
 
 
 def test_a_missing_avatar_is_named(tmp_path):
-    with pytest.raises(Exception, match="nothing.safetensors") as caught:
+    with pytest.raises(Exception, match=r"nothing\.safetensors") as caught:
         mi.load_dict({"type": "neural_sdf", "avatar": str(tmp_path / "nothing.safetensors")})
     assert isinstance(caught.value, (InputError, RuntimeError))
 

@@ -15,6 +15,9 @@ from sira_mi.fields.mlp import evaluate, evaluate_cooperative
 LOG_SHARPNESS = (-1.0, 5.5)
 LOG_AMPLITUDE = (-9.0, 7.0)
 INITIAL_SHARPNESS = 8.0
+# Where the specular decoder starts: the logit of skin's reflectance at normal incidence, 0.08 × FLARE's 0.375.
+SKIN_SPECULAR = 0.03
+_SPECULAR_LOGIT = float(np.log(SKIN_SPECULAR / (1 - SKIN_SPECULAR)))
 
 
 def _logistic(a):
@@ -34,8 +37,8 @@ def diffuse_albedo(network: list[tuple], octaves: int, x_ref, gamma):
 
 
 def specular_albedo(network: list[tuple], octaves: int, x_ref):
-    """Eq. 9b: monochrome specular albedo [1, N]."""
-    return _logistic(evaluate(network, encode(x_ref, octaves)))
+    """Eq. 9b: monochrome specular albedo [1, N], the reflectance at normal incidence."""
+    return _logistic(evaluate(network, encode(x_ref, octaves)) + _SPECULAR_LOGIT)
 
 
 def albedo_refinement(network: list[tuple], octaves: int, x_ref, gamma):
@@ -55,7 +58,8 @@ def diffuse_albedo_cooperative(packed, octaves: int, x_ref: list, gamma: list) -
 
 def specular_albedo_cooperative(packed, octaves: int, x_ref: list) -> list:
     """`specular_albedo` in symbolic code."""
-    return [_logistic(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves))]
+    outputs = evaluate_cooperative(packed, encode_cooperative(x_ref, octaves))
+    return [_logistic(mi.Float(a) + _SPECULAR_LOGIT) for a in outputs]
 
 
 def albedo_refinement_cooperative(packed, octaves: int, x_ref: list, gamma: list) -> list:

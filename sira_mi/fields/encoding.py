@@ -35,9 +35,7 @@ def encode_with_tangents(x, tangents: list, octaves: int):
     sine, cosine = dr.sin(phase), dr.cos(phase)
     features = dr.concat([x, sine, cosine], axis=0)
     slopes = [frequencies @ t for t in tangents]
-    return features, [
-        dr.concat([t, cosine * s, -sine * s], axis=0) for t, s in zip(tangents, slopes, strict=True)
-    ]
+    return features, [dr.concat([t, cosine * s, -sine * s], axis=0) for t, s in zip(tangents, slopes, strict=True)]
 
 
 def encode_cooperative(x: list, octaves: int) -> list:

@@ -54,8 +54,8 @@ class Architecture:
 
 
 def initial_parameters(architecture: Architecture, rng: np.random.Generator, output_scale: float = 1.0) -> np.ndarray:
-    """Flat parameters [architecture.parameters] float32: He-normal weights, zero biases, latent matrices N(0, 1/latent);
-    the output weights are scaled by `output_scale`."""
+    """Flat parameters [architecture.parameters] float32: He-normal weights, zero biases, latent matrices N(0,
+    1/latent); the output weights are scaled by `output_scale`."""
     pieces = []
     for k, (weight, bias, latent) in enumerate(architecture.shapes()):
         scale = output_scale if k == architecture.depth else 1.0

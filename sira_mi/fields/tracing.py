@@ -51,8 +51,9 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
 
 
 def first_crossings(field: SdfField, origin, direction, t):
-    """For rays that Newton steps did not bring onto the surface: the first change from outside to inside on even samples
-    from a little before t [1, N] to well behind it, as a linear estimate [1, N]; `_NO_CROSSING` where there is none.
+    """For rays that Newton steps did not bring onto the surface: the first change from outside to inside on even
+    samples from a little before t [1, N] to well behind it, as a linear estimate [1, N]; `_NO_CROSSING` where there is
+    none.
 
     Without gradients."""
     with dr.suspend_grad():
@@ -99,7 +100,7 @@ class DistanceGrid:
     spacing: float  # scene units
 
     @staticmethod
-    def of(grid: np.ndarray, spacing: float) -> "DistanceGrid":
+    def of(grid: np.ndarray, spacing: float) -> DistanceGrid:
         """From an array [nx, ny, nz]."""
         return DistanceGrid(mi.Float(np.ascontiguousarray(grid, np.float32).ravel()), grid.shape, spacing)
 
@@ -148,8 +149,8 @@ def closest_approach(grid: DistanceGrid, origin, direction, t_near, t_far, activ
 
 
 def refined_approach(field: SdfField, origin, direction, t, step: float):
-    """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and `step` to
-    either side, scene units, moved by no more than that. Rays are [3, N]. Without gradients."""
+    """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and at `step`
+    (scene units) to either side, moved by no more than that. Rays are [3, N]. Without gradients."""
     with dr.suspend_grad():
         behind, middle, ahead = (signed_distance(field, on_ray(origin, direction, t + k * step)) for k in (-1, 0, 1))
         curvature = dr.maximum(behind - 2.0 * middle + ahead, 1e-6)

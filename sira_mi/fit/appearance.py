@@ -38,8 +38,8 @@ class AppearanceProblem:
         self.z_l_prior = avatar.tensors["z_l"]
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's to
-        the rendered mean radiance at the prior's albedo, as one factor for all channels."""
+        """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's
+        to the rendered mean radiance at the prior's albedo, as one factor for all channels."""
         if stage.k_s[1] > 0 or "z_a" in stage.rates:
             return {}
         a = self.avatar.architecture
@@ -91,7 +91,9 @@ class AppearanceProblem:
             diffuse = base_diffuse * ratio
             moved = x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(index)))).astype(np.float32))
             rough = fine - albedo_refinement(network, a.refinement_octaves, moved, gamma)
-            terms["refinement"] = weights.refinement * self._refinement_loss(fine, base, base_diffuse, specular_radiance)
+            terms["refinement"] = weights.refinement * self._refinement_loss(
+                fine, base, base_diffuse, specular_radiance
+            )
             terms["smoothness"] = weights.smoothness * losses.mean(dr.abs(rough))
         terms["color"] = losses.photometric_loss(diffuse + specular_radiance, target)
         return terms

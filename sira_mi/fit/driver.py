@@ -63,11 +63,14 @@ def load_progress(path: Path, identity: str) -> Progress:
     """Reads a checkpoint. Raises InputError when it is damaged or belongs to another fit."""
     arrays, metadata = read_arrays(path)
     if metadata.get("identity") != identity:
-        raise InputError(f"{path} belongs to another photo, quality, seed or prior; choose another --out or drop --resume")
+        raise InputError(
+            f"{path} belongs to another photo, quality, seed or prior; choose another --out or drop --resume"
+        )
     try:
         description = json.loads(metadata["progress"])
         groups = {
-            kind: {k.removeprefix(kind): v for k, v in arrays.items() if k.startswith(kind)} for kind in ("tensor/", "adam/")
+            kind: {k.removeprefix(kind): v for k, v in arrays.items() if k.startswith(kind)}
+            for kind in ("tensor/", "adam/")
         }
         return Progress(tensors=groups["tensor/"], optimizer=groups["adam/"] or None, **description)
     except (KeyError, TypeError, ValueError) as error:
@@ -105,7 +108,9 @@ def run_stages(
                         progress.tensors |= parameter_values(optimizer)
                         progress.step, progress.optimizer = step, optimizer_state(optimizer)
                         if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                            progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+                            progress.seconds[stage.name] = (
+                                progress.seconds.get(stage.name, 0) + time.monotonic() - started
+                            )
                             started = saved = time.monotonic()
                             checkpoint(progress)
                         problem.refresh(progress.tensors)

@@ -146,7 +146,13 @@ def read_portrait(request: FitRequest, settings: FitSettings, prior: Avatar) -> 
 def identify(portrait, settings: FitSettings, seed: int, prior_path: Path) -> str:
     """A digest of all that a fit depends on; a checkpoint goes on only with the same."""
     digest = hashlib.sha256()
-    for array in (portrait.image, portrait.mask, portrait.landmarks, portrait.camera.K, portrait.camera.world_to_camera):
+    for array in (
+        portrait.image,
+        portrait.mask,
+        portrait.landmarks,
+        portrait.camera.K,
+        portrait.camera.world_to_camera,
+    ):
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(json.dumps(asdict(settings), sort_keys=True).encode())
     digest.update(str(seed).encode())

@@ -1,4 +1,5 @@
-"""The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF stays.
+"""The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF
+stays as it is.
 
 Colour and mask losses go through the `sira_radiance` integrator by `mi.render`; eikonal, landmark and regularising
 terms are evaluated on the field."""
@@ -80,7 +81,10 @@ class GeometryProblem:
         known = np.isfinite(mean).all(axis=1) & np.isfinite(self.portrait.landmarks).all(axis=1)
         if known.sum() < 6:
             return None
-        zero = {"z_sdf": mi.Float(np.zeros_like(avatar.tensors["z_sdf"])), "deformation": mi.Float(avatar.tensors["deformation"])}
+        zero = {
+            "z_sdf": mi.Float(np.zeros_like(avatar.tensors["z_sdf"])),
+            "deformation": mi.Float(avatar.tensors["deformation"]),
+        }
         field = self._field(zero)
         x_ref = evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
         pixels = self.portrait.landmarks[known].T.astype(np.float32)

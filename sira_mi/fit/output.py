@@ -19,6 +19,8 @@ from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.scene import head, principal_point_offset, sensor
 
+# The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
+_BRIGHTEST_SPECULAR = 0.08
 # Samples a pixel of the closed-form renders, against jagged outlines.
 _SAMPLES = 8
 # Channels of the `sira_sg` film: first channel and number of channels of every layer.
@@ -77,8 +79,10 @@ def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     depth."""
     if name == "normal":
         return np.where(mask[..., None] > 0, 0.5 + 0.5 * image, 0)
-    if name in ("specular_albedo", "mask"):
+    if name == "mask":
         return image
+    if name == "specular_albedo":
+        return image / _BRIGHTEST_SPECULAR
     if name == "depth":
         covered = mask > 0.99
         if not covered.any():
@@ -124,7 +128,7 @@ def write_scene(path: Path, camera: Camera) -> None:
     matrix = " ".join(f"{v:.9g}" for v in np.array(to_world).ravel())
     fov = sensor(camera)["fov"]
     text = f"""<?xml version="1.0" encoding="utf-8"?>
-<!-- A head fitted by SIRA for Mitsuba 3. In Python: import sira_mi; mitsuba.load_file("scene.xml", integrator="path") -->
+<!-- A head fitted by SIRA for Mitsuba 3: import sira_mi; mitsuba.load_file("scene.xml", integrator="path") -->
 <scene version="3.0.0">
     <default name="avatar" value="avatar.safetensors"/>
     <default name="lights" value="lights.json"/>
@@ -177,7 +181,11 @@ def write_scene(path: Path, camera: Camera) -> None:
 
 
 def contact_sheet(
-    input_image: np.ndarray, mask: np.ndarray, layers: dict[str, np.ndarray], turned: list[np.ndarray], box: tuple[int, int, int, int]
+    input_image: np.ndarray,
+    mask: np.ndarray,
+    layers: dict[str, np.ndarray],
+    turned: list[np.ndarray],
+    box: tuple[int, int, int, int],
 ) -> np.ndarray:
     """Display values of the sheet: photo, mask, final, normals / diffuse albedo, specular albedo, the head turned both
     ways under a second light. `box` (x0, y0, x1, y1) is the part of the photo's frame that is shown."""
@@ -194,7 +202,10 @@ def contact_sheet(
         canvas.paste(picture, ((side - size[0]) // 2, (side - size[1]) // 2))
         return np.asarray(canvas) / 255
 
-    shown = {name: preview(name, layers[name], layers["mask"]) for name in ("final", "normal", "diffuse_albedo", "specular_albedo")}
+    shown = {
+        name: preview(name, layers[name], layers["mask"])
+        for name in ("final", "normal", "diffuse_albedo", "specular_albedo")
+    }
     first = [linear_to_srgb(input_image), mask, shown["final"], shown["normal"]]
     second = [shown["diffuse_albedo"], shown["specular_albedo"], *turned]
     return np.concatenate([np.concatenate([tile(i) for i in row], axis=1) for row in (first, second)], axis=0)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
@@ -37,8 +37,7 @@ class AppearanceTraining:
     jitter: float = 0.03  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
     smoothness: float = 0.05  # λ7 (NeRFactor)
-    specular_anchor: float = 0.2  # pull of the specular albedo towards that of skin, which images hardly determine
-    skin_specular: float = 0.375  # mean specular albedo of skin (FLARE)
+    specular_anchor: float = 0.003  # pull of the log specular albedo to that of skin, which images hardly determine
     white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
 
 
@@ -64,7 +63,8 @@ def freeze_scene(
     settings: AppearanceTraining,
     rng: np.random.Generator,
 ) -> FrozenScene:
-    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at points of a scene."""
+    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at points of a
+    scene."""
     networks = architecture.networks
     field = SdfField(
         layers(networks["deformation"], mi.Float(shape["deformation"]), mi.TensorXf(z_sdf[:, None])),
@@ -142,8 +142,8 @@ def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.
 def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes):
     """Eq. 8 in closed form: diffuse and specular radiance [3, N] of surface points under `lobes` [N_l, 7].
 
-    `albedo` [3, N], `specular` [1, N], roughness and k_s numbers or [1, 1], unit `normals` [3, N], `views` [3, N] from the camera to the point. Normals that
-    face away from the camera are bent to grazing."""
+    `albedo` [3, N], `specular` [1, N], `roughness` and `k_s` numbers or [1, 1], unit `normals` [3, N], `views` [3, N]
+    from the camera to the point. Where a normal faces away from the camera there is no specular radiance."""
     irradiance, specular_radiance = shade(
         from_columns(normals, mi.Vector3f),
         from_columns(-views, mi.Vector3f),
@@ -180,7 +180,7 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
         )
         radiance.append(parts[0] + parts[1])
     difference = albedo - moved
-    anchor = specular - settings.skin_specular
+    anchor = dr.log(specular * (1 / SKIN_SPECULAR))
     amplitude = dr.log(lobes[:, 4:7, :])
     grey = amplitude - dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count))
     return {
@@ -200,7 +200,10 @@ def weighted_sum(terms: dict, settings: AppearanceTraining):
 def rates(settings: AppearanceTraining, step: int) -> dict[str, float]:
     """Learning rate of every parameter at `step`."""
     fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
-    return {**dict.fromkeys(NETWORKS, settings.learning_rate * fall), **dict.fromkeys(LATENTS, settings.latent_rate * fall)}
+    return {
+        **dict.fromkeys(NETWORKS, settings.learning_rate * fall),
+        **dict.fromkeys(LATENTS, settings.latent_rate * fall),
+    }
 
 
 def training_step(architecture, settings: AppearanceTraining, optimizer, batch: AppearanceBatch) -> dict[str, float]:

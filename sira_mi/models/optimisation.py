@@ -39,9 +39,8 @@ def optimizer_state(optimizer) -> dict[str, np.ndarray]:
     state = {}
     for name, (value, _, _, (count, first, second, *_)) in optimizer.state.items():
         state[f"{name}/value"] = dr.detach(value).numpy()
-        state[f"{name}/count"] = np.array([count], np.float32)
-        state[f"{name}/first"] = np.zeros_like(state[f"{name}/value"]) if count == 0 else first.numpy()
-        state[f"{name}/second"] = np.zeros_like(state[f"{name}/value"]) if count == 0 else second.numpy()
+        state[f"{name}/count"] = np.array([count[0]], np.float32)
+        state[f"{name}/first"], state[f"{name}/second"] = first.numpy(), second.numpy()
     return state
 
 
@@ -54,8 +53,9 @@ def restore_optimizer(optimizer, state: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"parameter {name} has another size")
         optimizer[name] = to_array(state[f"{name}/value"])
         value = optimizer.state[name][0]
-        moments = to_array(state[f"{name}/first"]), to_array(state[f"{name}/second"])
-        optimizer.state[name] = (value, promoted, rate, (int(state[f"{name}/count"][0]), *moments, *rest))
+        moments = mi.Float(state[f"{name}/first"].ravel()), mi.Float(state[f"{name}/second"].ravel())
+        count = mi.UInt32(int(state[f"{name}/count"].ravel()[0]))
+        optimizer.state[name] = (value, promoted, rate, (count, *moments, *rest))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:

@@ -35,7 +35,9 @@ def assemble_prior(
     light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
     that have them."""
     owners = {"z_sdf": "deformation", "z_r": "rendering", "z_a": "diffuse_albedo", "z_s": "specular_albedo"}
-    tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {name: appearance[name] for name in NETWORKS_OF_APPEARANCE}
+    tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {
+        name: appearance[name] for name in NETWORKS_OF_APPEARANCE
+    }
     latents = {**shape, **appearance}
     for name, network in owners.items():
         tensors[network] = centred(architecture, network, tensors[network], latents[name].mean(axis=1))

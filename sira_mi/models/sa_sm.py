@@ -42,7 +42,8 @@ class ShapeTraining:
 
 
 def initial_shape_model(architecture: AvatarArchitecture, settings: ShapeTraining, scenes: int, seed: int) -> dict:
-    """Starting values of all networks and latents [dim, scenes]: the reference a sphere, the deformation almost zero."""
+    """Starting values of all networks and latents [dim, scenes]: the reference a sphere, the deformation almost
+    zero."""
     rng = np.random.default_rng([seed, 0])
     networks = architecture.networks
     return {
@@ -74,7 +75,9 @@ class ShapeBatch:
 def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.random.Generator) -> ShapeBatch:
     """A random batch; landmarks that are unknown in any of the drawn scenes are left out of the draw."""
     chosen = np.sort(rng.choice(len(scenes), min(settings.scenes, len(scenes)), replace=False))
-    parts: dict[str, list] = {k: [] for k in ("points", "normals", "views", "colors", "volume", "distance", "landmarks")}
+    parts: dict[str, list] = {
+        k: [] for k in ("points", "normals", "views", "colors", "volume", "distance", "landmarks")
+    }
     known = np.all([np.isfinite(scenes[k].landmarks).all(axis=1) for k in chosen], axis=0)
     landmarks = rng.choice(np.flatnonzero(known), settings.landmarks)
     for k in chosen:
@@ -139,7 +142,10 @@ def weighted_sum(terms: dict, settings: ShapeTraining):
 def rates(settings: ShapeTraining, step: int) -> dict[str, float]:
     """Learning rate of every parameter at `step`."""
     fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
-    return {**dict.fromkeys(NETWORKS, settings.learning_rate * fall), **dict.fromkeys(LATENTS, settings.latent_rate * fall)}
+    return {
+        **dict.fromkeys(NETWORKS, settings.learning_rate * fall),
+        **dict.fromkeys(LATENTS, settings.latent_rate * fall),
+    }
 
 
 def training_step(architecture, settings: ShapeTraining, optimizer, batch: ShapeBatch) -> dict[str, float]:

@@ -6,6 +6,7 @@ Albedo truth is in the scene files too, but is not loaded here: training never s
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def load_scene(path: Path) -> TrainingScene:
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {name: file[name] for name in _ARRAYS}
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{path} is not a scene of a collection: {error}") from error
     rotation, translation = data["world_to_camera"][:, :3, :3], data["world_to_camera"][:, :3, 3]
     point, view = np.nonzero(data["visible"])
@@ -72,7 +73,9 @@ def load_training_scenes(folder: Path) -> list[TrainingScene]:
         manifest = json.loads((folder / "manifest.json").read_text())
         names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{folder} is not a collection: {error}; build one with python -m sira_mi.collection") from error
+        raise InputError(
+            f"{folder} is not a collection: {error}; build one with python -m sira_mi.collection"
+        ) from error
     if len(names) < 2:
         raise InputError(f"{folder} has {len(names)} training scenes; at least two are needed")
     return [load_scene(folder / Path(name).name) for name in names]
