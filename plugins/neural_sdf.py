@@ -1,7 +1,6 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 from sira_mi.fields import tracing
 from sira_mi.fields.columns import scatter_columns, to_columns
@@ -9,6 +8,7 @@ from sira_mi.fields.extraction import extract
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, signed_distance, surface
 from sira_mi.models.avatar import load_avatar
+from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 _FIELD_KEYS = ("deformation", "reference", "z_sdf")
 

@@ -1,7 +1,5 @@
 import drjit as dr
 import mitsuba as mi
-from sira_mi.plugins.neural_albedo import find_avatar
-from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.appearance import rendered_radiance
@@ -10,6 +8,8 @@ from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import normalised, signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit, refined_approach
 from sira_mi.models.avatar import load_avatar
+from sira_mi.plugins.neural_albedo import find_avatar
+from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
 # The closest approach that a ray outside the domain box is given, in scene units.
 FAR = 1.0

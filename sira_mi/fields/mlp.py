@@ -12,6 +12,7 @@ The hidden activation is a softplus with β = 100 (IDR, Yariv et al. 2020).
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -42,10 +43,7 @@ class Architecture:
         """Per layer the shapes of its weight [out, in], bias [out, 1] and latent matrix [out, latent]; the output
         layer has an empty latent matrix."""
         sizes = [self.inputs] + [self.width] * self.depth + [self.outputs]
-        return [
-            ((o, i), (o, 1), (o, self.latent if k < self.depth else 0))
-            for k, (i, o) in enumerate(zip(sizes[:-1], sizes[1:], strict=True))
-        ]
+        return [((o, i), (o, 1), (o, self.latent if k < self.depth else 0)) for k, (i, o) in enumerate(pairwise(sizes))]
 
     @property
     def parameters(self) -> int:

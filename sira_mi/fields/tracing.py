@@ -149,7 +149,7 @@ def closest_approach(grid: DistanceGrid, origin, direction, t_near, t_far, activ
 
 
 def refined_approach(field: SdfField, origin, direction, t, step: float):
-    """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and at `step`
+    """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and `step`
     (scene units) to either side, moved by no more than that. Rays are [3, N]. Without gradients."""
     with dr.suspend_grad():
         behind, middle, ahead = (signed_distance(field, on_ray(origin, direction, t + k * step)) for k in (-1, 0, 1))

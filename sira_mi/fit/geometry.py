@@ -9,6 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.errors import InputError
+from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
 from sira_mi.fit.rays import modelled_pixels, window_around, window_camera, window_pixels
@@ -107,7 +109,12 @@ class GeometryProblem:
         for name, key in _PARAMETERS.items():
             self.parameters[key] = mi.Float(tensors[name])
         self.parameters.set_dirty("head.z_sdf")
-        self.parameters.update()
+        try:
+            self.parameters.update()
+        except EmptySurfaceError as error:
+            raise InputError(
+                "the fit lost its surface; check the mask and the camera, or try another --seed"
+            ) from error
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
             self._place_landmarks(self._field(self._fixed))
