@@ -15,6 +15,7 @@ from PIL import Image
 
 from sira_mi.errors import InputError
 from sira_mi.fields.sdf import deform, evaluate_in_chunks
+from sira_mi.files import write_exr
 from sira_mi.models.avatar import save_avatar
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module
@@ -24,7 +25,7 @@ from sira_mi.relight.render import RelightSettings, load_head, render_passes, tu
 from sira_mi.relight.subject import Light, Subject, read_light, read_subject
 from sira_mi.scene import head, sensor
 from sira_mi.sg.fit_environment import render_environment
-from sira_mi.sg.lights_io import write_environment, write_lights
+from sira_mi.sg.lights_io import write_lights
 
 # A key from the front left and a dim dome: smooth, so that few samples suffice.
 LOBES = np.array([[-0.5, 0.4, 0.76, 6, 2.0, 1.8, 1.5], [0, 1, 0, 0.5, 0.3, 0.35, 0.4]], np.float32)
@@ -177,7 +178,7 @@ def test_lights_are_the_photos_own_by_default(avatar):
 def test_exr_lights_are_exact_for_path_and_fitted_for_sg(avatar, tmp_path):
     path = tmp_path / "environment.EXR"
     image = render_environment(LOBES, 16)
-    write_environment(path, image)
+    write_exr(path, image)
     np.testing.assert_array_equal(read_light(path, avatar, lobes=False).image, image)
     fitted = read_light(path, avatar, lobes=True, count=6)
     assert fitted.image is None and fitted.lobes.shape == (6, 7)

@@ -13,6 +13,7 @@ mi.set_variant("llvm_ad_rgb")
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain  # noqa: E402
 
 from sira_mi.errors import InputError  # noqa: E402
+from sira_mi.files import write_exr  # noqa: E402
 from sira_mi.sg import lights_io  # noqa: E402
 from sira_mi.sg.fit_environment import render_environment, total_light  # noqa: E402
 from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions  # noqa: E402
@@ -102,7 +103,7 @@ def test_agrees_with_mitsubas_envmap():
 
 def test_path_traced_ball_agrees_with_mitsubas_envmap(tmp_path):
     """Emitter sampling, BSDF sampling and misses under `path`, against the written EXR."""
-    lights_io.write_environment(tmp_path / "lights.exr", render_environment(LOBES, 256))
+    write_exr(tmp_path / "lights.exr", render_environment(LOBES, 256))
     images = []
     for light in (
         {"type": "sg_envmap", "lobes": mi.TensorXf(LOBES)},
@@ -183,7 +184,7 @@ def test_files_round_trip(tmp_path):
     np.testing.assert_array_equal(light.lobes.numpy(), written)
 
     image = render_environment(LOBES, 32)
-    lights_io.write_environment(tmp_path / "lights.exr", image)
+    write_exr(tmp_path / "lights.exr", image)
     np.testing.assert_array_equal(lights_io.read_environment(tmp_path / "lights.exr"), image)
     light = mi.load_dict({"type": "sg_envmap", "filename": str(tmp_path / "lights.exr"), "lobe_count": 12})
     assert light.lobes.shape == (12, 7)
@@ -231,14 +232,14 @@ def test_bad_environment_files_are_named(tmp_path):
     expect("no such file")
     path.write_bytes(b"not an image")
     expect("not a readable OpenEXR")
-    lights_io.write_environment(path, np.ones((16, 32, 3)))
+    write_exr(path, np.ones((16, 32, 3)))
     path.write_bytes(path.read_bytes()[:-60])
     expect("not a readable OpenEXR")
-    lights_io.write_environment(path, np.ones((16, 16, 3)))
+    write_exr(path, np.ones((16, 16, 3)))
     expect("latitude-longitude")
     image = np.ones((16, 32, 3), np.float32)
     image[3, 4, 1] = np.nan
-    lights_io.write_environment(path, image)
+    write_exr(path, image)
     expect("not finite")
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": np.ones((16, 32), np.float32)}) as file:
         file.write(str(path))
@@ -246,8 +247,8 @@ def test_bad_environment_files_are_named(tmp_path):
 
 
 def test_unwritable_output_leaves_nothing(tmp_path):
-    for write, value in ((lights_io.write_lights, LOBES), (lights_io.write_environment, np.ones((4, 8, 3)))):
-        with pytest.raises(InputError, match="cannot be written"):
+    for write, value in ((lights_io.write_lights, LOBES), (write_exr, np.ones((4, 8, 3)))):
+        with pytest.raises(InputError, match="cannot write"):
             write(tmp_path / "missing" / "lights.x", value)
     with pytest.raises(InputError, match="lobe 0"):
         lights_io.write_lights(tmp_path / "lights.json", np.zeros((1, 7)))

@@ -131,6 +131,8 @@ def render_views(
     y = mi.Float(pixel // size % size) + jitter.y
     ray = mi.RayDifferential3f(_camera_ray(intrinsics, poses, view, x, y))
     radiance, valid, _ = scene.integrator().sample(scene, sampler, ray)
+    # A rare sample of `principled` at grazing angles is not a number; it counts as black.
+    radiance = [dr.select(dr.isfinite(channel), channel, 0.0) for channel in radiance]
     channels = [*radiance, dr.select(valid, mi.Float(1), mi.Float(0))]
     dr.eval(channels)
     channels = [dr.block_sum(channel, samples) / samples for channel in channels]

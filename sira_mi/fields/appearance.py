@@ -10,6 +10,7 @@ import numpy as np
 
 from sira_mi.fields.encoding import encode, encode_cooperative
 from sira_mi.fields.mlp import evaluate, evaluate_cooperative
+from sira_mi.sg.lobes import fibonacci_directions
 
 # Bounds of the illumination decoder: log-sharpness and log-amplitude of a lobe, and its initial sharpness.
 LOG_SHARPNESS = (-1.0, 5.5)
@@ -73,22 +74,13 @@ def deform_cooperative(packed, octaves: int, x: list) -> tuple[list, list]:
     return [a + d for a, d in zip(x, h[:3], strict=True)], h[3:]
 
 
-def fibonacci_directions(count: int) -> np.ndarray:
-    """`count` unit vectors [count, 3] spread evenly over the sphere."""
-    k = np.arange(count) + 0.5
-    y = 1 - 2 * k / count
-    azimuth = np.pi * (1 + np.sqrt(5)) * k
-    radius = np.sqrt(1 - y * y)
-    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1).astype(np.float32)
-
-
 def illumination(network: list[tuple], latent):
     """Illumination decoder: z_l [dim, S] -> lobes [N_l, 7, S] (axis, sharpness, RGB amplitude), offsets from evenly
     spread lobes; sharpness and amplitude are bounded exponentials, so that no latent leads to an infinite light."""
     h = evaluate(network, latent)
     count, scenes = h.shape[0] // 7, h.shape[1]
     h = dr.reshape(h, (count, 7, scenes))
-    base = mi.TensorXf(np.repeat(fibonacci_directions(count)[:, :, None], scenes, axis=2))
+    base = mi.TensorXf(np.repeat(fibonacci_directions(count).astype(np.float32)[:, :, None], scenes, axis=2))
     axis = base + h[:, 0:3, :]
     square = axis * axis
     axis = axis / dr.sqrt(square[:, 0:1, :] + square[:, 1:2, :] + square[:, 2:3, :] + 1e-8)

@@ -53,7 +53,7 @@ def load_scene(path: Path) -> TrainingScene:
     except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{path} is not a scene of a collection: {error}") from error
     rotation, translation = data["world_to_camera"][:, :3, :3], data["world_to_camera"][:, :3, 3]
-    point, view = np.nonzero(data["visible"])
+    point, view = np.nonzero(data["visible"] & np.isfinite(data["colors"]).all(axis=2))
     return TrainingScene(
         points=data["points"].astype(np.float32),
         normals=data["normals"].astype(np.float32),

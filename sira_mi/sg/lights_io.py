@@ -5,13 +5,13 @@
 
 import json
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
 from sira_mi.errors import InputError
+from sira_mi.files import write_through
 
 MAXIMUM_LOBES = 4096
 # Width and height of an environment image that is still read.
@@ -78,24 +78,12 @@ def read_lights(path: str | Path) -> np.ndarray:
     return check_lobes(np.array(rows), str(path))
 
 
-def _replace(path: Path, write) -> None:
-    """Calls `write(temporary)` and renames; nothing half-written stays behind."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def write_lights(path: str | Path, lobes: np.ndarray) -> None:
     """Writes a `lights.json` of lobes `[N_l, 7]` atomically; reading it back gives the same float32 values."""
     rows = check_lobes(lobes, str(path)).tolist()
     entries = [{"axis": row[:3], "sharpness": row[3], "amplitude": row[4:]} for row in rows]
     text = ",\n  ".join(json.dumps(entry) for entry in entries)
-    _replace(Path(path), lambda file: file.write_text(f'{{"lobes": [\n  {text}\n]}}\n', encoding="utf-8"))
+    write_through(path, lambda file: file.write_text(f'{{"lobes": [\n  {text}\n]}}\n', encoding="utf-8"))
 
 
 def read_environment(path: str | Path) -> np.ndarray:
@@ -121,18 +109,3 @@ def read_environment(path: str | Path) -> np.ndarray:
     if not np.isfinite(image).all():
         raise InputError(f"{path}: holds values that are not finite")
     return np.maximum(image, 0.0)
-
-
-def write_environment(path: str | Path, image: np.ndarray) -> None:
-    """Writes radiance `[H, W, 3]` as a 32-bit OpenEXR, atomically."""
-    image = np.ascontiguousarray(image, np.float32)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-
-    def write(file):
-        try:
-            with OpenEXR.File(header, {"RGB": image}) as output:
-                output.write(str(file))
-        except RuntimeError as error:
-            raise OSError(f"OpenEXR: {error}") from error
-
-    _replace(Path(path), write)
