@@ -23,6 +23,7 @@ from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progres
 from sira_mi.fit.rays import modelled_pixels
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, FitSettings
 from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 from sira_mi.scene import orbited
 from sira_mi.sg.fit_environment import render_environment
@@ -226,11 +227,12 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     output.write_renders(out / "renders", layers)
     output.write_mesh(out / "mesh.ply", scene.shapes()[0])
 
+    box = output.head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
+    close = output.box_camera(portrait.camera, box)
     turned = []
     for yaw in (-30, 30):
-        view = output.avatar_scene(str(avatar_path), orbited(portrait.camera, yaw), output.SECOND_LIGHT, settings.voxel)
-        turned.append(output.preview("final", output.render_layers(view, 4)["final"], portrait.mask))
-    box = output.head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
+        view = output.avatar_scene(str(avatar_path), orbited(close, yaw), output.SECOND_LIGHT, settings.voxel)
+        turned.append(linear_to_srgb(output.render_layers(view)["final"]))
     write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))
 
     inside = portrait.mask * (layers["mask"] > 0.99)

@@ -21,8 +21,10 @@ from sira_mi.scene import head, principal_point_offset, sensor
 
 # The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
 _BRIGHTEST_SPECULAR = 0.08
-# Samples a pixel of the closed-form renders, against jagged outlines.
-_SAMPLES = 8
+# Samples a pixel of the closed-form renders.
+_SAMPLES = 4
+# Side of a picture in the contact sheet, pixels.
+_TILE = 320
 # Channels of the `sira_sg` film: first channel and number of channels of every layer.
 LAYERS = {
     "final": (0, 3),
@@ -46,15 +48,9 @@ SECOND_LIGHT = np.array(
 )
 
 
-def render_layers(scene: mi.Scene, samples: int = _SAMPLES) -> dict[str, np.ndarray]:
-    """All layers of a scene with a `sira_sg` integrator: [H, W, 3], one-channel ones [H, W].
-
-    Sample passes are rendered one after the other, which bounds the memory."""
-    total = None
-    for k in range(samples):
-        image = mi.render(scene, spp=1, seed=k).numpy().astype(np.float64)
-        total = image if total is None else total + image
-    image = (total / samples).astype(np.float32)
+def render_layers(scene: mi.Scene) -> dict[str, np.ndarray]:
+    """All layers of an `avatar_scene`: [H, W, 3], one-channel ones [H, W]."""
+    image = mi.render(scene, spp=_SAMPLES, seed=0).numpy()
     return {
         name: image[..., start] if count == 1 else image[..., start : start + count]
         for name, (start, count) in LAYERS.items()
@@ -62,12 +58,13 @@ def render_layers(scene: mi.Scene, samples: int = _SAMPLES) -> dict[str, np.ndar
 
 
 def avatar_scene(avatar_path: str, camera: Camera, lobes: np.ndarray, voxel: float) -> mi.Scene:
-    """The head of an avatar file before a black background, closed-form shading, `lobes` [N_l, 7] as its light."""
+    """The head of an avatar file before a black background, closed-form shading, `lobes` [N_l, 7] as its light; evenly
+    spread samples in each pixel, against jagged outlines."""
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "sira_sg", "hide_emitters": True},
-            "sensor": sensor(camera),
+            "sensor": sensor(camera, {"type": "stratified", "sample_count": _SAMPLES}),
             "head": head(avatar_path, voxel),
             "light": {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)},
         }
@@ -180,35 +177,35 @@ def write_scene(path: Path, camera: Camera) -> None:
     write_through(path, lambda p: p.write_text(text, encoding="utf-8"))
 
 
+def box_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
+    """The camera of a tile of the contact sheet: of the part `box` (x0, y0, x1, y1) of the photo's frame."""
+    x0, y0, x1, y1 = box
+    scale = _TILE / max(x1 - x0, y1 - y0)
+    return camera.cropped(x0, y0, x1 - x0, y1 - y0).scaled(scale, scale)
+
+
+def _tile(image: np.ndarray) -> np.ndarray:
+    """Display values [H, W, 3] or [H, W], fitted into a square of the contact sheet."""
+    pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    scale = _TILE / max(image.shape[:2])
+    size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+    canvas = Image.new("RGB", (_TILE, _TILE))
+    canvas.paste(Image.fromarray(pixels).resize(size, Image.LANCZOS), ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2))
+    return np.asarray(canvas) / 255
+
+
 def contact_sheet(
-    input_image: np.ndarray,
-    mask: np.ndarray,
-    layers: dict[str, np.ndarray],
-    turned: list[np.ndarray],
-    box: tuple[int, int, int, int],
+    photo: np.ndarray, mask: np.ndarray, layers: dict, turned: list[np.ndarray], box: tuple
 ) -> np.ndarray:
     """Display values of the sheet: photo, mask, final, normals / diffuse albedo, specular albedo, the head turned both
-    ways under a second light. `box` (x0, y0, x1, y1) is the part of the photo's frame that is shown."""
+    ways under a second light (display values of `box_camera`). `box` (x0, y0, x1, y1) is the part of the photo's frame
+    that is shown."""
     x0, y0, x1, y1 = box
-
-    def tile(image):
-        image = image[y0:y1, x0:x1]
-        image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-        side = 320
-        scale = side / max(image.shape[:2])
-        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-        picture = Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)).resize(size, Image.LANCZOS)
-        canvas = Image.new("RGB", (side, side))
-        canvas.paste(picture, ((side - size[0]) // 2, (side - size[1]) // 2))
-        return np.asarray(canvas) / 255
-
-    shown = {
-        name: preview(name, layers[name], layers["mask"])
-        for name in ("final", "normal", "diffuse_albedo", "specular_albedo")
-    }
-    first = [linear_to_srgb(input_image), mask, shown["final"], shown["normal"]]
-    second = [shown["diffuse_albedo"], shown["specular_albedo"], *turned]
-    return np.concatenate([np.concatenate([tile(i) for i in row], axis=1) for row in (first, second)], axis=0)
+    names = ("final", "normal", "diffuse_albedo", "specular_albedo")
+    shown = [preview(name, layers[name], layers["mask"]) for name in names]
+    framed = [image[y0:y1, x0:x1] for image in (linear_to_srgb(photo), mask, *shown)]
+    rows = framed[:4], [*framed[4:], *turned]
+    return np.concatenate([np.concatenate([_tile(i) for i in row], axis=1) for row in rows], axis=0)
 
 
 def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:

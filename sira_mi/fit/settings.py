@@ -81,8 +81,8 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
             APPEARANCE,
             Stage(
                 "refinement",
-                steps(500),
-                {"z_l": 1e-3, "illumination": 1e-4, "z_s": 2e-3, "albedo_refinement": 2e-3},
+                steps(800),
+                {"z_l": 1e-3, "illumination": 1e-4, "z_s": 2e-3, "albedo_refinement": 5e-3},
                 k_s=(1.0, 1.0),
                 k_r=1.0,
             ),
@@ -96,6 +96,6 @@ def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float) -
 
 QUALITIES = {
     "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.04, _stages(1.0)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.03, _stages(2.5)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(1.0)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(2.5)),
 }

@@ -7,6 +7,8 @@ WHITE is f^s without Fresnel (F = 1), GRAZING is f^s with F = P. Of each part ti
 - ENERGY: log of its integral over the hemisphere;
 - TURN and SHARPNESS: of the lobe that has, also times the cosine, the same mean direction. Its axis is along
   m + TURN (c m − n), m the mirror direction; SHARPNESS is the log of 2 (1 + c²) / λ times its sharpness, λ = 2/r⁴.
+
+The constants are made by `python benchmarks/fit_specular_table.py --write`.
 """
 
 # fmt: off
