@@ -8,11 +8,13 @@ import argparse
 import json
 from pathlib import Path
 
+import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
+
+# isort: split
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-import sira_mi  # noqa: F401  (finds LLVM)
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance, surface

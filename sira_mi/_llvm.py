@@ -3,6 +3,7 @@
 import os
 import sys
 import sysconfig
+import warnings
 from pathlib import Path
 
 
@@ -17,6 +18,14 @@ def locate_llvm() -> Path | None:
 
 
 def configure_llvm() -> None:
-    """Sets `DRJIT_LIBLLVM_PATH` before Dr.Jit is first imported; a value that the user set is left alone."""
-    if "DRJIT_LIBLLVM_PATH" not in os.environ and (library := locate_llvm()) is not None:
-        os.environ["DRJIT_LIBLLVM_PATH"] = str(library)
+    """Sets `DRJIT_LIBLLVM_PATH` before Dr.Jit is first imported; a value that the user set is left alone. Warns when
+    Dr.Jit was imported already and hence looked for an LLVM of its own."""
+    if "DRJIT_LIBLLVM_PATH" in os.environ or (library := locate_llvm()) is None:
+        return
+    if "drjit" in sys.modules:
+        warnings.warn(
+            "import sira_mi before mitsuba and drjit: they look for LLVM when imported, and may not have found "
+            "the one installed with sira_mi",
+            stacklevel=3,
+        )
+    os.environ["DRJIT_LIBLLVM_PATH"] = str(library)

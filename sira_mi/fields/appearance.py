@@ -10,6 +10,7 @@ import numpy as np
 
 from sira_mi.fields.encoding import encode, encode_cooperative
 from sira_mi.fields.mlp import evaluate, evaluate_cooperative
+from sira_mi.fields.sdf import in_three
 from sira_mi.sg.lobes import fibonacci_directions
 
 # Bounds of the illumination decoder: log-sharpness and log-amplitude of a lobe, and its initial sharpness.
@@ -83,7 +84,8 @@ def illumination(network: list[tuple], latent):
     base = mi.TensorXf(np.repeat(fibonacci_directions(count).astype(np.float32)[:, :, None], scenes, axis=2))
     axis = base + h[:, 0:3, :]
     square = axis * axis
-    axis = axis / dr.sqrt(square[:, 0:1, :] + square[:, 1:2, :] + square[:, 2:3, :] + 1e-8)
+    length = dr.sqrt(square[:, 0:1, :] + square[:, 1:2, :] + square[:, 2:3, :] + 1e-8)
+    axis = axis / in_three(length, axis=1)
     sharpness = dr.exp(_bounded(h[:, 3:4, :] + float(np.log(INITIAL_SHARPNESS)), *LOG_SHARPNESS))
     amplitude = dr.exp(_bounded(h[:, 4:7, :] - 1.0, *LOG_AMPLITUDE))
     return dr.concat([axis, sharpness, amplitude], axis=1)

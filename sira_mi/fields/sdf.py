@@ -85,11 +85,17 @@ def surface(field: SdfField, x):
     return value, dr.concat(slopes, axis=0), x_ref, gamma
 
 
+def in_three(row, axis: int = 0):
+    """A row repeated three times along `axis`. Dr.Jit's own broadcast has an atomic scatter as its adjoint, whose sum
+    of three varies with the order of threads; a concatenation has not."""
+    return dr.concat([row, row, row], axis=axis)
+
+
 def normalised(v):
     """Columns of v [3, N] scaled to unit length; columns shorter than 1e-6 stay finite."""
     square = v * v
     length = dr.sqrt(square[0:1, :] + square[1:2, :] + square[2:3, :] + 1e-12)
-    return v / length
+    return v / in_three(length)
 
 
 def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:

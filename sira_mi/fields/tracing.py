@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER
-from sira_mi.fields.sdf import SdfField, signed_distance, signed_distance_and_slope
+from sira_mi.fields.sdf import SdfField, in_three, signed_distance, signed_distance_and_slope
 
 # A hit counts as exact when |f| is below this many scene units (IDR's 5e-5 of a unit sphere).
 HIT_TOLERANCE = 1e-4
@@ -26,7 +26,7 @@ _NO_CROSSING = 1e9
 def on_ray(origin, direction, t):
     """Points o + t v [3, N] of rays at t [1, N]. In Dr.Jit 1.5 a plain product with an unevaluated tensor [1, 1] widens
     that tensor itself, which a single ray would meet."""
-    return origin + dr.concat([t, t, t], axis=0) * direction
+    return origin + in_three(t) * direction
 
 
 def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
@@ -88,7 +88,7 @@ def differentiable_hit(field: SdfField, origin, direction, t):
     f, slope = signed_distance_and_slope(field, x, direction)
     slope = dr.detach(slope)
     safe = dr.select(dr.abs(slope) < _MINIMUM_SLOPE, dr.copysign(_MINIMUM_SLOPE, slope), slope)
-    return x - direction * ((f - dr.detach(f)) / safe)
+    return x - direction * in_three((f - dr.detach(f)) / safe)
 
 
 @dataclass(frozen=True)

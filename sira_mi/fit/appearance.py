@@ -13,7 +13,7 @@ from sira_mi.fields.appearance import (
     specular_albedo,
 )
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import evaluate_in_chunks, surface
+from sira_mi.fields.sdf import evaluate_in_chunks, in_three, surface
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.models import losses
 from sira_mi.models.af_sm import physical_radiance
@@ -171,5 +171,5 @@ def _chroma(lobes):
     """Mean squared log-chroma of the lobes' amplitudes."""
     logarithm = dr.log(lobes[:, 4:7])
     grey = dr.reshape(dr.mean(logarithm, axis=1), (-1, 1))
-    deviation = logarithm - grey
+    deviation = logarithm - in_three(grey, axis=1)
     return losses.mean(deviation * deviation)

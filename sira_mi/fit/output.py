@@ -79,7 +79,7 @@ def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if name == "mask":
         return image
     if name == "specular_albedo":
-        return image / _BRIGHTEST_SPECULAR
+        return linear_to_srgb(image / _BRIGHTEST_SPECULAR)
     if name == "depth":
         covered = mask > 0.99
         if not covered.any():

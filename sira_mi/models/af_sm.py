@@ -13,7 +13,7 @@ import numpy as np
 from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
+from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, in_three, surface
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture
 from sira_mi.models.scenes import TrainingScene
@@ -27,7 +27,7 @@ LATENTS = ("z_a", "z_s", "z_l")
 class AppearanceTraining:
     """Settings of the AF-SM training; λ as in eq. 10."""
 
-    steps: int = 4000
+    steps: int = 1500
     scenes: int = 8  # scenes a step
     points: int = 512  # a scene and step
     frozen_points: int = 6000  # of each scene's points, drawn once, at which the frozen deformation is evaluated
@@ -182,7 +182,7 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     difference = albedo - moved
     anchor = dr.log(specular * (1 / SKIN_SPECULAR))
     amplitude = dr.log(lobes[:, 4:7, :])
-    grey = amplitude - dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count))
+    grey = amplitude - in_three(dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count)), axis=1)
     return {
         "color": losses.photometric_loss(dr.concat(radiance, axis=1), batch.colors),
         "embedding": losses.embedding_loss(z_a) + losses.embedding_loss(z_s) + losses.embedding_loss(z_l),
