@@ -39,7 +39,8 @@ class SiraSG(mi.SamplingIntegrator):
 
     Hits are exact. Differentiable in everything that the scene exposes: lobes, albedo networks and latents, k_s and
     k_r, and, through implicit differentiation, the shape's latent and networks (interior derivatives; for silhouettes
-    see `sira_radiance` and the stock projective integrators). Cannot be nested in symbolic code.
+    see `sira_radiance` and the stock projective integrators). Cannot be nested in symbolic code. Derivatives
+    repeat bit for bit, but for those of lobes through a background that is shown, which the emitter sums by atomics.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.3; PhySG (Zhang et al. 2021).
 

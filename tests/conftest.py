@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from sira_mi.fields.appearance import fibonacci_directions
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
 from sira_mi.portrait.camera import Camera
@@ -42,6 +41,16 @@ SMALL = AvatarArchitecture(
 )
 
 
+def even_directions(count: int) -> np.ndarray:
+    """`count` unit vectors [count, 3] spread evenly over the sphere; of the fixtures alone, so that these stay as they
+    are."""
+    k = np.arange(count) + 0.5
+    y = 1 - 2 * k / count
+    azimuth = np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - y * y)
+    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1).astype(np.float32)
+
+
 def smooth_sphere(architecture: Architecture, rng: np.random.Generator, radius: float) -> np.ndarray:
     """Flat parameters of a smooth field close to |x| − radius: even directions far within the bend of the softplus,
     then layers close to the identity. (The geometric initialisation is a coarse sphere when its layers are narrow.)"""
@@ -50,7 +59,7 @@ def smooth_sphere(architecture: Architecture, rng: np.random.Generator, radius: 
     for k, (weight, bias, latent) in enumerate(architecture.shapes()):
         matrix, offset = np.zeros(weight), np.zeros(bias)
         if k == 0:
-            matrix[:, :3] = first * fibonacci_directions(weight[0])
+            matrix[:, :3] = first * even_directions(weight[0])
         elif k < architecture.depth:
             matrix = np.eye(weight[0]) + 0.02 * rng.standard_normal(weight)
             offset += lift if k == 1 else 0
@@ -91,7 +100,7 @@ def small_avatar(seed: int = 1) -> Avatar:
     }
     sharpness = rng.uniform(2, 20, (SMALL.lobes, 1))
     amplitude = rng.uniform(0.2, 1.0, (SMALL.lobes, 3))
-    tensors["lobes"] = np.concatenate([fibonacci_directions(SMALL.lobes), sharpness, amplitude], axis=1)
+    tensors["lobes"] = np.concatenate([even_directions(SMALL.lobes), sharpness, amplitude], axis=1)
     return Avatar(SMALL, {name: value.astype(np.float32) for name, value in tensors.items()})
 
 
