@@ -50,7 +50,7 @@ class SiraBSDF(mi.BSDF):
         "bsdf": {
             "type": "sira_bsdf",
             "diffuse_albedo": {"type": "rgb", "value": [0.6, 0.4, 0.3]},
-            "specular_albedo": 0.375,
+            "specular_albedo": 0.03,
             "roughness": 0.5,
         }
     """

@@ -5,7 +5,8 @@ fitted over 0 < c < 1 and 0.2 <= r <= 1 to 26 × 14 quadratures of 256 × 512 no
 WHITE is f^s without Fresnel (F = 1), GRAZING is f^s with F = P. Of each part times the light's cosine (ω·n)₊:
 
 - ENERGY: log of its integral over the hemisphere;
-- TURN and SHARPNESS: of the lobe that has, also times the cosine, the same mean direction. Its axis is along
+- TURN and SHARPNESS: of the lobe that has, also times the cosine, the same mean direction, or the nearest
+  within the solver's bounds. Its axis is along
   m + TURN (c m − n), m the mirror direction; SHARPNESS is the log of 2 (1 + c²) / λ times its sharpness, λ = 2/r⁴.
 
 The constants are made by `python benchmarks/fit_specular_table.py --write`.
