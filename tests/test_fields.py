@@ -198,6 +198,41 @@ def test_several_latents_at_once_equal_single_evaluations(avatar):
     assert np.abs(gradient - summed).max() < 1e-5 * np.abs(summed).max()
 
 
+@pytest.mark.parametrize("latents", [1, 4])
+def test_fused_layers_equal_plain_operations_in_value_and_both_passes(latents):
+    """`evaluate_with_tangents` has its derivatives written out: they are those that Dr.Jit finds for the same in plain
+    operations, in the reverse pass for every input and in the forward pass along a random direction."""
+    network, rng = mlp.Architecture(5, 3, 8, 3, 4), np.random.default_rng(0)
+    arrays = [mlp.initial_parameters(network, rng) / 5, rng.standard_normal((4, latents)) * 0.1]
+    arrays += [rng.standard_normal((5, 6 * latents)) * 0.05 for _ in range(3)]
+    kinds = (mi.Float, *[mi.TensorXf] * 4)
+
+    def loss(function, inputs):
+        parameters, latent, x, *tangents = inputs
+        value, slopes = function(mlp.layers(network, parameters, latent), x, tangents)
+        return dr.sum(value * value, axis=None) + dr.sum(slopes[0] * slopes[1] * slopes[1], axis=None)
+
+    def fresh():
+        inputs = [kind(a.astype(np.float32)) for kind, a in zip(kinds, arrays, strict=True)]
+        dr.enable_grad(*inputs)
+        return inputs
+
+    results = {}
+    for function in (mlp.evaluate_reference, mlp.evaluate_with_tangents):
+        inputs = fresh()
+        total = loss(function, inputs)
+        dr.backward(total)
+        reverse = [dr.grad(i).numpy() for i in inputs]
+        inputs = fresh()
+        for k, (i, kind, a) in enumerate(zip(inputs, kinds, arrays, strict=True)):
+            dr.set_grad(i, kind(np.random.default_rng(k).standard_normal(a.shape).astype(np.float32)))
+        forward = dr.forward_to(loss(function, inputs))
+        results[function] = [total.numpy(), *reverse, forward.numpy()]
+    for plain, fused in zip(*results.values(), strict=True):
+        assert np.abs(plain).max() > 0
+        np.testing.assert_allclose(fused, plain, atol=2e-5 * np.abs(plain).max())
+
+
 def test_gradients_repeat_bit_for_bit(avatar):
     """With latents, tangents and many points; atomic additions would differ from run to run."""
     x = mi.TensorXf(points_near_surface(20000))

@@ -22,7 +22,7 @@ from sira_mi.models.optimisation import (
     restore_optimizer,
     write_arrays,
 )
-from sira_mi.models.prior import assemble_prior, centred
+from sira_mi.models.prior import assemble_prior, whitened, whitening
 from sira_mi.models.scenes import TrainingScene, load_scene, load_training_scenes
 from sira_mi.models.training import run_training
 
@@ -218,11 +218,17 @@ def test_a_step_of_half_the_scenes_moves_only_their_latents(two_scenes):
 
 
 def test_batches_keep_the_points_of_a_scene_together(two_scenes):
+    """Of each scene first its surface points, then its volume points, whose distances fit."""
     batch = sa_sm.draw_batch(two_scenes, SHAPE, np.random.default_rng(3))
-    for points in (batch.points.numpy(), batch.landmarks.numpy()):
-        n = points.shape[1] // 2
-        for k, radius in enumerate((1.2, 1.5)):
-            np.testing.assert_allclose(np.linalg.norm(points[:, k * n : (k + 1) * n], axis=0), radius, rtol=1e-5)
+    points, n, q = batch.points.numpy().reshape(3, 2, -1), SHAPE.surface_points, SHAPE.volume_points
+    assert points.shape == (3, 2, n + q)
+    landmarks, distance = batch.landmarks.numpy().reshape(3, 2, -1), batch.volume_distance.numpy().reshape(2, -1)
+    for k, radius in enumerate((1.2, 1.5)):
+        np.testing.assert_allclose(np.linalg.norm(points[:, k, :n], axis=0), radius, rtol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(landmarks[:, k], axis=0), radius, rtol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(points[:, k, n:], axis=0) - radius, distance[k], atol=1e-5)
+    again = sa_sm._columns_of(batch.points, 2, n, n + q).numpy().reshape(3, 2, q)
+    np.testing.assert_array_equal(again, points[:, :, n:])
     np.testing.assert_array_equal(batch.scenes.numpy(), np.eye(2))
     assert (np.abs(np.linalg.norm(batch.views.numpy(), axis=0) - 1) < 1e-5).all()
     inward = (batch.views.numpy() * batch.normals.numpy()).sum(axis=0)
@@ -283,13 +289,19 @@ def test_a_loss_that_is_not_finite_ends_the_training(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["deformation", "diffuse_albedo"])
-def test_the_centred_network_at_zero_is_the_network_at_the_mean(name):
+def test_the_whitened_network_takes_standard_normal_latents(name):
+    """It equals the trained network at mean + spread z, and spread spreadᵀ is the trained latents' covariance."""
     architecture = SMALL.networks[name]
-    flat, mean = random(architecture.parameters) * 0.3, random(architecture.latent, seed=1)
+    flat, trained = random(architecture.parameters) * 0.3, random(architecture.latent, 9, seed=1)
+    mean, spread = whitening(trained)
+    np.testing.assert_allclose(spread @ spread.T, np.cov(trained), atol=1e-5)
+    lengths = np.linalg.norm(spread, axis=0)
+    assert (np.diff(lengths) <= 1e-6).all()
     offset, h = random(architecture.latent, seed=2), mi.TensorXf(random(architecture.inputs, 20, seed=3))
-    moved = centred(SMALL, name, flat, mean)
+    moved = whitened(SMALL, name, flat, mean, spread)
     for shift in (np.zeros_like(mean), offset):
-        original = evaluate(layers(architecture, mi.Float(flat), mi.TensorXf((mean + shift)[:, None])), h)
+        latent = (mean + spread @ shift)[:, None].astype(np.float32)
+        original = evaluate(layers(architecture, mi.Float(flat), mi.TensorXf(latent)), h)
         now = evaluate(layers(architecture, mi.Float(moved), mi.TensorXf(shift[:, None])), h)
         np.testing.assert_allclose(now.numpy(), original.numpy(), atol=2e-5 * np.abs(original.numpy()).max())
 

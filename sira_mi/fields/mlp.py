@@ -63,29 +63,36 @@ def initial_parameters(architecture: Architecture, rng: np.random.Generator, out
     return np.concatenate(pieces).astype(np.float32)
 
 
+def _add_bias(h, bias):
+    """h [W, S·n] + bias [W, S], each of the S columns of the bias for n consecutive points."""
+    rows, columns = bias.shape
+    if columns == 1:
+        return h + bias
+    return dr.reshape(dr.reshape(h, (rows, columns, -1)) + dr.reshape(bias, (rows, columns, 1)), h.shape)
+
+
+def _sum_columns(gradient, columns: int):
+    """The adjoint of `_add_bias` in its bias: an axis sum [W, S]. The one of Dr.Jit's broadcast is an atomic scatter,
+    whose result varies from run to run."""
+    rows = gradient.shape[0]
+    total = dr.sum(dr.reshape(gradient, (rows, columns, -1)), axis=2)
+    return type(gradient)(total.array, (rows, columns))
+
+
 class _AddBias(dr.CustomOp):
-    """h [W, S·n] + b [W, S], each of the S columns of b for n consecutive points.
+    """`_add_bias` with `_sum_columns` as its adjoint."""
 
-    The adjoint of b is an axis sum: the one of Dr.Jit's broadcast is an atomic scatter, whose result varies from run
-    to run."""
-
-    def eval(self, h, b):
-        self.bias_shape = b.shape
-        rows, columns = b.shape
-        shape = h.shape
-        if columns == 1:
-            return h + b
-        return dr.reshape(dr.reshape(h, (rows, columns, -1)) + dr.reshape(b, (rows, columns, 1)), shape)
+    def eval(self, h, bias):
+        self.columns = bias.shape[1]
+        return _add_bias(h, bias)
 
     def forward(self):
-        self.set_grad_out(self.eval(self.grad_in("h"), self.grad_in("b")))
+        self.set_grad_out(_add_bias(self.grad_in("h"), self.grad_in("bias")))
 
     def backward(self):
         gradient = self.grad_out()
-        rows, columns = self.bias_shape
         self.set_grad_in("h", gradient)
-        total = dr.sum(dr.reshape(gradient, (rows, columns, -1)), axis=2)
-        self.set_grad_in("b", type(gradient)(total.array, (rows, columns)))
+        self.set_grad_in("bias", _sum_columns(gradient, self.columns))
 
 
 def layers(architecture: Architecture, parameters, latent=None) -> list[tuple]:
@@ -125,19 +132,68 @@ def _softplus_slope(a):
     return dr.select(a >= 0.0, r, e * r)
 
 
+class _HiddenLayer(dr.CustomOp):
+    """softplus(W h + b) with the directional derivatives σ(β a) ⊙ W t carried along, one launch a pass.
+
+    The reverse pass is written out, a = W h + b, s = σ(β a), s' = β s (1 − s): with the adjoints h̄ and t̄_k of the
+    outputs, ā = s ⊙ h̄ + s' ⊙ Σ_k t̄_k ⊙ W t_k and ū_k = s ⊙ t̄_k are the adjoints of a and of W t_k. Left to automatic
+    differentiation the same takes several times as many kernels."""
+
+    def eval(self, weight, bias, h, tangents):
+        self.weight, self.h, self.tangents = weight, h, tangents
+        self.columns = bias.shape[1]
+        self.a = _add_bias(weight @ h, bias)
+        self.moved = [weight @ t for t in tangents]
+        slope = _softplus_slope(self.a)
+        result = _softplus(self.a), [m * slope for m in self.moved]
+        dr.eval(self.a, result)
+        return result
+
+    def forward(self):
+        weight, h, tangents = self.grad_in("weight"), self.grad_in("h"), self.grad_in("tangents")
+        slope = _softplus_slope(self.a)
+        bend = SOFTPLUS_SHARPNESS * slope * (1.0 - slope)
+        a = _add_bias(weight @ self.h + self.weight @ h, self.grad_in("bias"))
+        moved = [weight @ t + self.weight @ d for t, d in zip(self.tangents, tangents, strict=True)]
+        self.set_grad_out(
+            (slope * a, [slope * d + bend * a * m for d, m in zip(moved, self.moved, strict=True)]),
+        )
+
+    def backward(self):
+        h, tangents = self.grad_out()
+        slope = _softplus_slope(self.a)
+        bend = SOFTPLUS_SHARPNESS * slope * (1.0 - slope)
+        a = slope * h
+        for t, m in zip(tangents, self.moved, strict=True):
+            a += bend * t * m
+        moved = [slope * t for t in tangents]
+        dr.eval(a, moved)
+        weight = dr.matmul(a, self.h, Bt=True)
+        for u, t in zip(moved, self.tangents, strict=True):
+            weight += dr.matmul(u, t, Bt=True)
+        self.set_grad_in("weight", weight)
+        self.set_grad_in("bias", _sum_columns(a, self.columns))
+        self.set_grad_in("h", dr.matmul(self.weight, a, At=True))
+        self.set_grad_in("tangents", [dr.matmul(self.weight, u, At=True) for u in moved])
+
+
 def evaluate(network: list[tuple], h):
     """Tensor mode: features [inputs, N] -> outputs [outputs, N]. With S latents, N is a multiple of S and the points
     of one latent are consecutive."""
-    for k, (weight, bias) in enumerate(network):
-        h = dr.custom(_AddBias, weight @ h, bias)
-        if k + 1 < len(network):
-            h = _softplus(h)
-    return h
+    return evaluate_with_tangents(network, h, [])[0]
 
 
 def evaluate_with_tangents(network: list[tuple], h, tangents: list):
     """`evaluate`, carrying directional derivatives [inputs, N] of the features along: returns the outputs and their
     derivatives [outputs, N]. Dr.Jit has no second-order AD, so a gradient that a loss depends on is primal code."""
+    for weight, bias in network[:-1]:
+        h, tangents = dr.custom(_HiddenLayer, weight, bias, h, tangents)
+    weight, bias = network[-1]
+    return dr.custom(_AddBias, weight @ h, bias), [weight @ t for t in tangents]
+
+
+def evaluate_reference(network: list[tuple], h, tangents: list):
+    """`evaluate_with_tangents` in plain operations, differentiated by Dr.Jit: the slow version that tests compare."""
     for k, (weight, bias) in enumerate(network):
         h = dr.custom(_AddBias, weight @ h, bias)
         tangents = [weight @ t for t in tangents]

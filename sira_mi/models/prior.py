@@ -11,15 +11,28 @@ NETWORKS_OF_SHAPE = ("deformation", "reference", "rendering")
 NETWORKS_OF_APPEARANCE = ("diffuse_albedo", "specular_albedo", "illumination")
 
 
-def centred(architecture, name: str, network: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Network parameters whose zero latent is what the latent `mean` was: Z mean is added to every bias."""
+def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [dim] of latents [dim, scenes] and a matrix [dim, dim] that takes a standard normal vector to their
+    covariance: its columns are the principal directions, the widest first, as long as their standard deviations."""
+    mean = latents.mean(axis=1)
+    directions, deviations, _ = np.linalg.svd(latents - mean[:, None], full_matrices=True)
+    padded = np.zeros(len(latents))
+    padded[: len(deviations)] = deviations / np.sqrt(max(latents.shape[1] - 1, 1))
+    return mean, directions * padded
+
+
+def whitened(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Network parameters that take a standard normal latent z for what `mean + spread z` was: in every layer Z mean is
+    added to the bias, and Z spread takes the place of Z."""
     flat, offset = network.copy(), 0
     for weight, bias, latent in architecture.networks[name].shapes():
         start_bias = offset + weight[0] * weight[1]
         start_latent = start_bias + bias[0]
         offset = start_latent + latent[0] * latent[1]
         if latent[1]:
-            flat[start_bias:start_latent] += flat[start_latent:offset].reshape(latent) @ mean
+            matrix = flat[start_latent:offset].reshape(latent)
+            flat[start_bias:start_latent] += matrix @ mean
+            flat[start_latent:offset] = (matrix @ spread).ravel()
     return flat
 
 
@@ -31,7 +44,8 @@ def assemble_prior(
     roughness: float,
     seed: int,
 ) -> Avatar:
-    """The mean head of both trained models: latents [dim, scenes] are centred on their mean, the light is the mean
+    """The mean head of both trained models. The latents of shape, radiance and albedo become standard normal: the zero
+    latent is the mean of the trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean
     light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
     that have them."""
     owners = {"z_sdf": "deformation", "z_r": "rendering", "z_a": "diffuse_albedo", "z_s": "specular_albedo"}
@@ -40,7 +54,7 @@ def assemble_prior(
     }
     latents = {**shape, **appearance}
     for name, network in owners.items():
-        tensors[network] = centred(architecture, network, tensors[network], latents[name].mean(axis=1))
+        tensors[network] = whitened(architecture, network, tensors[network], *whitening(latents[name]))
     for name, size in architecture.latents.items():
         tensors[name] = np.zeros(size, np.float32)
     tensors["z_l"] = latents["z_l"].mean(axis=1)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.errors import InputError
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import SdfField, deform, normalised, sphere_parameters, surface
@@ -23,11 +24,11 @@ LATENTS = ("z_sdf", "z_r")
 class ShapeTraining:
     """Settings of the SA-SM training; λ as in eq. 7."""
 
-    steps: int = 4000
-    scenes: int = 8  # scenes a step
-    surface_points: int = 384  # a scene and step
-    volume_points: int = 128  # a scene and step
-    landmarks: int = 48  # a scene and step
+    steps: int = 12_000
+    scenes: int = 32  # scenes a step
+    surface_points: int = 96  # a scene and step
+    volume_points: int = 32  # a scene and step
+    landmarks: int = 24  # a scene and step
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
     latent_rate: float = 4e-3  # of the latents
     initial_radius: float = 1.4  # of the reference sphere, scene units
@@ -59,15 +60,14 @@ def initial_shape_model(architecture: AvatarArchitecture, settings: ShapeTrainin
 
 @dataclass(frozen=True)
 class ShapeBatch:
-    """Points of some scenes, the points of one scene consecutive; tensors."""
+    """Points of some scenes, those of one scene consecutive; tensors."""
 
     scenes: mi.TensorXf  # [total scenes, S] one-hot columns that pick the scenes' latents
     count: int  # S
-    points: mi.TensorXf  # [3, S·n]
-    normals: mi.TensorXf  # [3, S·n]
+    points: mi.TensorXf  # [3, S·(n + q)]: of each scene first n surface points, then q volume points
+    normals: mi.TensorXf  # [3, S·n] at the surface points
     views: mi.TensorXf  # [3, S·n]
     colors: mi.TensorXf  # [3, S·n]
-    volume: mi.TensorXf  # [3, S·q]
     volume_distance: mi.TensorXf  # [1, S·q]
     landmarks: mi.TensorXf  # [3, S·l]
 
@@ -75,36 +75,36 @@ class ShapeBatch:
 def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.random.Generator) -> ShapeBatch:
     """A random batch; landmarks that are unknown in any of the drawn scenes are left out of the draw."""
     chosen = np.sort(rng.choice(len(scenes), min(settings.scenes, len(scenes)), replace=False))
-    parts: dict[str, list] = {
-        k: [] for k in ("points", "normals", "views", "colors", "volume", "distance", "landmarks")
-    }
+    parts: dict[str, list] = {k: [] for k in ("points", "normals", "views", "colors", "volume_distance", "landmarks")}
     known = np.all([np.isfinite(scenes[k].landmarks).all(axis=1) for k in chosen], axis=0)
+    if not known.any():
+        raise InputError("no landmark is known in all scenes of a batch; check the landmarks of the collection")
     landmarks = rng.choice(np.flatnonzero(known), settings.landmarks)
     for k in chosen:
         scene = scenes[k]
         samples = rng.integers(len(scene.sample_point), size=settings.surface_points)
         points = scene.sample_point[samples]
         volume = rng.integers(len(scene.volume), size=settings.volume_points)
-        parts["points"].append(scene.points[points])
+        parts["points"] += [scene.points[points], scene.volume[volume]]
         parts["normals"].append(scene.normals[points])
         parts["views"].append(scene.views(samples))
         parts["colors"].append(scene.sample_color[samples])
-        parts["volume"].append(scene.volume[volume])
-        parts["distance"].append(scene.volume_distance[volume][:, None])
+        parts["volume_distance"].append(scene.volume_distance[volume][:, None])
         parts["landmarks"].append(scene.landmarks[landmarks])
     one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
     one_hot[chosen, np.arange(len(chosen))] = 1
     tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v).T, dtype=np.float32)) for k, v in parts.items()}
-    return ShapeBatch(
-        mi.TensorXf(one_hot),
-        len(chosen),
-        tensor["points"],
-        tensor["normals"],
-        tensor["views"],
-        tensor["colors"],
-        tensor["volume"],
-        tensor["distance"],
-        tensor["landmarks"],
+    return ShapeBatch(mi.TensorXf(one_hot), len(chosen), **tensor)
+
+
+def _columns_of(tensor, scenes: int, first: int, last: int):
+    """Columns `first` to `last` of each scene's share: tensor [rows, S·m] -> [rows, S·(last − first)]."""
+    rows, total = tensor.shape
+    width = total // scenes
+    index = dr.arange(mi.UInt32, rows * scenes * (last - first))
+    group, column = index // (last - first), index % (last - first)
+    return mi.TensorXf(
+        dr.gather(mi.Float, tensor.array, group * width + first + column), (rows, scenes * (last - first))
     )
 
 
@@ -117,8 +117,12 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         layers(networks["reference"], parameters["reference"]),
         architecture.sdf_octaves,
     )
-    f, gradient, x_ref, gamma = surface(field, batch.points)
-    f_volume, gradient_volume, _, _ = surface(field, batch.volume)
+    n = batch.normals.shape[1] // batch.count
+    width = batch.points.shape[1] // batch.count
+    everywhere = surface(field, batch.points)
+    f, gradient, x_ref, gamma = (_columns_of(t, batch.count, 0, n) for t in everywhere)
+    f_volume, gradient_volume = (_columns_of(t, batch.count, n, width) for t in everywhere[:2])
+    points = _columns_of(batch.points, batch.count, 0, n)
     rendering = layers(networks["rendering"], parameters["rendering"], z_r)
     octaves = architecture.rendering_octaves
     radiance = rendered_radiance(rendering, octaves, x_ref, normalised(gradient), batch.views, gamma)
@@ -127,7 +131,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         "normal": losses.normal_loss(gradient, batch.normals),
         "distance": losses.distance_loss(f_volume, batch.volume_distance),
         "eikonal": losses.eikonal_loss(gradient_volume),
-        "deformation": losses.deformation_loss(x_ref - batch.points, batch.count),
+        "deformation": losses.deformation_loss(x_ref - points, batch.count),
         "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
         "color": losses.photometric_loss(radiance, batch.colors),
         "embedding": losses.embedding_loss(z_sdf) + losses.embedding_loss(z_r),
@@ -154,4 +158,5 @@ def training_step(architecture, settings: ShapeTraining, optimizer, batch: Shape
     terms = shape_losses(architecture, dict(optimizer.items()), batch)
     dr.backward(weighted_sum(terms, settings))
     optimizer.step()
+    dr.eval(terms)
     return {name: float(value.numpy().item()) for name, value in terms.items()}

@@ -1,6 +1,7 @@
 """Training scenes: the arrays of a collection that the statistical models may see.
 
-Albedo truth is in the scene files too, but is not loaded here: training never sees it.
+Albedo truth is in the scene files too, but is not loaded here: training never sees it. Nor does it see the views
+`HELD_OUT_VIEWS`, on which renderings are compared.
 """
 
 import json
@@ -10,6 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from sira_mi.conventions import HELD_OUT_VIEWS
 from sira_mi.errors import InputError
 
 _ARRAYS = (
@@ -53,15 +55,17 @@ def load_scene(path: Path) -> TrainingScene:
     except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{path} is not a scene of a collection: {error}") from error
     rotation, translation = data["world_to_camera"][:, :3, :3], data["world_to_camera"][:, :3, 3]
-    point, view = np.nonzero(data["visible"] & np.isfinite(data["colors"]).all(axis=2))
+    usable = data["visible"] & np.isfinite(data["colors"]).all(axis=2)
+    usable[:, np.isin(np.arange(usable.shape[1]), HELD_OUT_VIEWS)] = False
+    point, view = np.nonzero(usable)
     return TrainingScene(
         points=data["points"].astype(np.float32),
         normals=data["normals"].astype(np.float32),
         volume=data["volume"].astype(np.float32),
         volume_distance=data["volume_distance"].astype(np.float32),
         landmarks=np.where(data["landmarks_valid"][:, None], data["landmarks"], np.nan).astype(np.float32),
-        sample_point=point,
-        sample_view=view,
+        sample_point=point.astype(np.int32),
+        sample_view=view.astype(np.uint8),
         sample_color=data["colors"][point, view].astype(np.float32),
         camera_centres=(-np.einsum("vji,vj->vi", rotation, translation)).astype(np.float32),
     )
