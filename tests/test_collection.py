@@ -15,7 +15,9 @@ from scipy.spatial import cKDTree
 from sira_mi.collection import build as building
 from sira_mi.collection import hair, landmarks, look, makehuman, outer, person, render, scene, skin, surface
 from sira_mi.collection.annotate_landmarks import attach, symmetrise
-from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
+from sira_mi.collection.sources.makehuman import MakeHumanSource
+from sira_mi.collection.subject import BrokenHead
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMINANCE
 from sira_mi.errors import InputError
 
 SMALL = scene.SceneSettings(points=1500, volume=1200, render=render.RenderSettings(size=48, samples=4))
@@ -53,7 +55,7 @@ def hair_folder(tmp_path_factory) -> Path:
 def arrays(variant, hair_folder) -> dict:
     """A small scene whose person wears the cap."""
     seed = next(s for s in range(50) if np.random.default_rng([s, 1]) and person.make_person(s, hair_folder).cut)
-    return scene.make_scene(seed, hair_folder, [], SMALL)
+    return scene.make_scene(MakeHumanSource(1, hair_folder).subject(0, seed), seed, [], SMALL)
 
 
 def random_identity(seed: int) -> makehuman.Identity:
@@ -215,6 +217,8 @@ def test_scene_has_the_documented_layout(arrays):
     assert arrays["images"].shape == (views, 48, 48, 3) and arrays["volume_distance"].shape == (SMALL.volume,)
     assert set(np.unique(arrays["region"])) == {0, 1, 2, 3}
     assert np.allclose(np.linalg.norm(arrays["normals"], axis=1), 1, atol=1e-3)
+    truth = arrays["albedo_images"].shape, arrays["specular_images"].shape
+    assert truth == ((len(HELD_OUT_VIEWS), 48, 48, 3), (len(HELD_OUT_VIEWS), 48, 48))
     inside = (arrays["points"] > DOMAIN_LOWER) & (arrays["points"] < DOMAIN_UPPER)
     assert inside.all()
     info = json.loads(str(arrays["info"]))
@@ -263,8 +267,22 @@ def test_frontal_exposure_is_photographic(arrays):
     assert luminance[arrays["masks"][0][rows] > 0].mean() == pytest.approx(target, rel=0.1)
 
 
+def test_albedo_images_are_the_albedo_of_the_points(arrays):
+    """Points that a held-out view sees project to pixels of their own albedo and specular strength."""
+    for row, view in enumerate(HELD_OUT_VIEWS):
+        seen = arrays["visible"][:, view]
+        pixel, _ = render.project(arrays["points"][seen], arrays["K"][view], arrays["world_to_camera"][view])
+        x, y = np.floor(pixel).astype(int).T
+        for name, image in (("albedo", "albedo_images"), ("specular", "specular_images")):
+            gap = np.abs(arrays[image][row][y, x].astype(float) - arrays[name][seen].astype(float))
+            assert np.median(gap) < 0.02, name
+        empty = arrays["masks"][view] == 0
+        assert arrays["albedo_images"][row][empty].mean() < 0.01
+
+
 def test_scenes_repeat_bit_for_bit(arrays, hair_folder):
-    again = scene.make_scene(json.loads(str(arrays["info"]))["seed"], hair_folder, [], SMALL)
+    seed = json.loads(str(arrays["info"]))["seed"]
+    again = scene.make_scene(MakeHumanSource(1, hair_folder).subject(0, seed), seed, [], SMALL)
     for name in scene.LAYOUT:
         assert np.array_equal(arrays[name], again[name]), name
 
@@ -324,31 +342,54 @@ def test_symmetrise_pairs_noisy_mirror_points():
     assert np.abs(even - points).max() < 0.1
 
 
+class FakeSource:
+    """Three identities, the last of them broken."""
+
+    name, licence = "fake", "none"
+
+    def count(self):
+        return 3
+
+    def subject(self, number, seed):
+        if number == 2:
+            raise BrokenHead("a broken mesh")
+        return number
+
+
 def test_build_resumes_lists_errors_and_splits(variant, tmp_path, monkeypatch):
-    settings = building.BuildSettings(count=4, seed=7, hair=None, hdri=None, workers=1)
+    settings = building.BuildSettings(sources=(FakeSource(),), seed=7, hdri=None, workers=1)
     made = []
 
-    def fake(seed, hair_folder, maps, scene_settings):
-        if seed == 7_000_002:
-            raise ValueError("a broken mesh")
-        made.append(seed)
-        return {name: np.zeros(1) for name in scene.LAYOUT}
+    def fake(subject, seed, maps, scene_settings):
+        made.append(subject)
+        info = {"name": f"fake/{subject}", "group": {"sex": "unknown"}, "licence": "none", "seed": seed}
+        return {name: np.zeros(1) for name in scene.LAYOUT} | {"info": np.array(json.dumps(info))}
 
     monkeypatch.setattr(building, "make_scene", fake)
     manifest = building.build(tmp_path, settings)
-    assert manifest["counts"] == {"train": 3, "test": 0, "failed": 1}
-    assert "a broken mesh" in manifest["scenes"][2]["error"]
-    (tmp_path / "scene_0001.npz").write_bytes(b"cut short")
-    building.build(tmp_path, settings)
-    assert made == [7_000_000, 7_000_001, 7_000_003, 7_000_001]
-    assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["count"] == 4
+    assert manifest["counts"] == {"train": 2, "test": 0, "failed": 1}
+    assert manifest["scenes"][2]["error"] == "a broken mesh"
+    (tmp_path / "fake_0001.npz").write_bytes(b"cut short")
+    again = building.build(tmp_path, settings)
+    assert made == [0, 1, 1]
+    assert [entry.get("group") for entry in again["scenes"]] == [entry.get("group") for entry in manifest["scenes"]]
+    assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["sources"] == {"fake": 3}
     assert not list(tmp_path.glob(".*"))
-    assert [building.split_of(i, 100) for i in (87, 88)] == ["train", "test"]
+
+
+def test_the_split_of_an_identity_does_not_depend_on_the_count():
+    """One in eight of each source is a test identity, and seeds differ between sources and collections."""
+    assert [building.split_of(number) for number in (6, 7, 8, 15)] == ["train", "test", "train", "test"]
+    settings = [building.BuildSettings((), seed, None, 1) for seed in (0, 1)]
+    other = FakeSource()
+    other.name = "other"
+    seeds = {building.scene_seed(s, source, n) for s in settings for source in (FakeSource(), other) for n in range(9)}
+    assert len(seeds) == 36
 
 
 def test_bad_input_ends_with_one_line(tmp_path):
-    settings = building.BuildSettings(count=1, seed=0, hair=tmp_path / "none", hdri=None, workers=1)
-    with pytest.raises(InputError, match="no such folder"):
+    settings = building.BuildSettings((MakeHumanSource(1, None),), seed=0, hdri=tmp_path, workers=1)
+    with pytest.raises(InputError, match=r"no \.exr"):
         building.build(tmp_path / "out", settings)
     damaged = tmp_path / "scene_0000.npz"
     damaged.write_bytes(b"no archive")

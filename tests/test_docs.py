@@ -29,3 +29,12 @@ def test_links_and_equation_table_point_at_what_exists():
     for module, name in re.findall(r"`((?:fields|models|sg|fit)\.\w+)\.(?:\w+\.)?(\w+)`", table.split("## Three")[0]):
         source = (ROOT / "sira_mi" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
         assert f"def {name}(" in source, f"{module}.{name}"
+
+
+def test_the_collection_page_lists_the_arrays_of_a_scene():
+    """The table of `docs/collection.md` is `LAYOUT`."""
+    from sira_mi.collection.scene import LAYOUT
+
+    page = (ROOT / "docs" / "collection.md").read_text(encoding="utf-8")
+    for name, content in LAYOUT.items():
+        assert f"| `{name}` | {content} |" in page, name

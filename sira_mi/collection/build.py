@@ -1,5 +1,6 @@
 """Builds a folder of scenes: resumable, parallel, with a manifest of seeds, split, licences and errors."""
 
+import hashlib
 import json
 import multiprocessing
 import os
@@ -13,90 +14,108 @@ import mitsuba as mi
 import numpy as np
 from tqdm import tqdm
 
-from sira_mi.collection.hair import list_hair
-from sira_mi.collection.scene import LAYOUT, LICENCE, SceneSettings, make_scene, save_scene
+from sira_mi.collection.scene import LAYOUT, SceneSettings, make_scene, save_scene
+from sira_mi.collection.subject import BrokenHead, Source
 from sira_mi.errors import InputError
+from sira_mi.files import write_through
 
 VARIANT = "llvm_ad_rgb"
-TEST_SHARE = 0.12
+# Of every source, each identity whose number leaves this remainder is a test identity, whatever the count.
+TEST_EVERY, TEST_REMAINDER = 8, 7
 
 
 @dataclass(frozen=True)
 class BuildSettings:
-    count: int  # scenes
-    seed: int  # of the first scene; scene i has seed `seed` * 1,000,000 + i
-    hair: Path | None  # folder of hair meshes; without it every head is bald or shaven
+    sources: tuple[Source, ...]
+    seed: int  # of the collection
     hdri: Path | None  # folder of .exr environment maps; without it lights are SGs, sun and sky
     workers: int  # processes
 
 
-def scene_name(index: int) -> str:
-    return f"scene_{index:04d}.npz"
+def scene_name(source: Source, number: int) -> str:
+    return f"{source.name}_{number:04d}.npz"
 
 
-def split_of(index: int, count: int) -> str:
-    """`test` for the last `TEST_SHARE` of the identities, else `train`."""
-    return "test" if index >= count - round(TEST_SHARE * count) else "train"
+def scene_seed(settings: BuildSettings, source: Source, number: int) -> int:
+    """A seed that depends on the collection's, the source and the identity's number only."""
+    text = f"{settings.seed}/{source.name}/{number}"
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
-def is_complete(path: Path) -> bool:
-    """Whether a file holds every array of the layout."""
+def split_of(number: int) -> str:
+    """`test` for one identity in `TEST_EVERY` of each source, else `train`."""
+    return "test" if number % TEST_EVERY == TEST_REMAINDER else "train"
+
+
+def finished_info(path: Path) -> dict | None:
+    """`info` of a scene file that holds every array of the layout, else None."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{name}.npy" for name in LAYOUT} <= set(archive.namelist())
-    except (OSError, zipfile.BadZipFile):
-        return False
+        with np.load(path, allow_pickle=False) as data:
+            return json.loads(str(data["info"])) if set(LAYOUT) <= set(data.files) else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
 
 
-def build_one(index: int, out: Path, settings: BuildSettings, scene_settings: SceneSettings) -> dict:
+def build_one(task: tuple[Source, int], out: Path, settings: BuildSettings, scene_settings: SceneSettings) -> dict:
     """Makes one scene unless it is complete; returns its manifest entry, with `error` when it failed."""
-    path = out / scene_name(index)
-    seed = settings.seed * 1_000_000 + index
-    entry = {"file": path.name, "seed": seed, "split": split_of(index, settings.count), "licence": LICENCE}
-    if is_complete(path):
-        return entry
+    source, number = task
+    path, seed = out / scene_name(source, number), scene_seed(settings, source, number)
+    entry = {"file": path.name, "source": source.name, "number": number, "seed": seed, "split": split_of(number)}
+    info = finished_info(path)
+    if info is not None and info.get("seed") == seed:
+        return entry | _of_info(info)
     if mi.variant() != VARIANT:
         mi.set_variant(VARIANT)
     maps = sorted(settings.hdri.glob("*.exr")) if settings.hdri else []
-    start = time.perf_counter()
+    start = time.process_time()
     try:
-        save_scene(path, make_scene(seed, settings.hair, maps, scene_settings))
+        scene = make_scene(source.subject(number, seed), seed, maps, scene_settings)
+        save_scene(path, scene)
     except InputError:
         raise
+    except BrokenHead as error:
+        return entry | {"licence": source.licence, "error": str(error)}
     except Exception as error:
-        return entry | {"error": f"{type(error).__name__}: {error}"}
-    return entry | {"seconds": round(time.perf_counter() - start, 2)}
+        return entry | {"licence": source.licence, "error": f"{type(error).__name__}: {error}"}
+    return entry | _of_info(json.loads(str(scene["info"]))) | {"core_seconds": round(time.process_time() - start, 2)}
+
+
+def _of_info(info: dict) -> dict:
+    return {key: info[key] for key in ("name", "group", "licence")}
 
 
 def build(out: Path, settings: BuildSettings, scene_settings: SceneSettings | None = None) -> dict:
     """Builds all scenes and returns the manifest, which is also written to `manifest.json`."""
     scene_settings = scene_settings or SceneSettings()
-    if settings.count < 1:
-        raise InputError("--count must be at least 1")
-    if settings.hair is not None:
-        list_hair(settings.hair)
+    tasks = [(source, number) for source in settings.sources for number in range(source.count())]
+    if not tasks:
+        raise InputError("no heads to build; give --count or a source")
     if settings.hdri is not None and not any(settings.hdri.glob("*.exr")):
         raise InputError(f"{settings.hdri}: no .exr environment maps found")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out}: cannot be created ({error.strerror})") from None
-    for stale in out.glob(".scene_*.tmp"):
+    for stale in out.glob(".*.tmp"):
         stale.unlink()
     work = partial(build_one, out=out, settings=settings, scene_settings=scene_settings)
-    indices = range(settings.count)
-    bar = partial(tqdm, total=settings.count, unit="scene", dynamic_ncols=True)
+    bar = partial(tqdm, total=len(tasks), unit="scene", dynamic_ncols=True)
     if settings.workers > 1:
         context = multiprocessing.get_context("spawn")
         threads = max(1, (os.cpu_count() or 1) // settings.workers)
         with context.Pool(settings.workers, initializer=_limit_threads, initargs=(threads,)) as pool:
-            entries = list(bar(pool.imap(work, indices)))
+            entries = list(bar(pool.imap(work, tasks)))
     else:
-        entries = list(bar(map(work, indices)))
+        entries = list(bar(map(work, tasks)))
     manifest = {
-        "format": "sira-mi collection 1",
+        "format": "sira-mi collection 2",
         "layout": LAYOUT,
-        "settings": json.loads(json.dumps(asdict(settings) | {"scene": asdict(scene_settings)}, default=_plain)),
+        "settings": {
+            "seed": settings.seed,
+            "hdri": settings.hdri and settings.hdri.name,
+            "sources": {source.name: source.count() for source in settings.sources},
+            "scene": asdict(scene_settings),
+        },
         "counts": {
             "train": sum(e["split"] == "train" and "error" not in e for e in entries),
             "test": sum(e["split"] == "test" and "error" not in e for e in entries),
@@ -104,14 +123,8 @@ def build(out: Path, settings: BuildSettings, scene_settings: SceneSettings | No
         },
         "scenes": entries,
     }
-    temporary = out / ".manifest.json.tmp"
-    temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
-    temporary.replace(out / "manifest.json")
+    write_through(out / "manifest.json", lambda file: file.write_text(json.dumps(manifest, indent=1), encoding="utf-8"))
     return manifest
-
-
-def _plain(value):
-    return value.name if isinstance(value, Path) else str(value)
 
 
 def _limit_threads(count: int) -> None:

@@ -1,10 +1,8 @@
-"""What is drawn per person besides the shape: skin tone, hair, eyes and clothes, in line with the identity."""
+"""What is drawn per person besides the shape: skin tone, hair, eyes and clothes, in line with age, sex and ancestry."""
 
 from dataclasses import dataclass
 
 import numpy as np
-
-from sira_mi.collection.makehuman import Identity
 
 # Mean melanin of `makehuman.ANCESTRIES`.
 MELANIN = np.array([0.7, 0.2, 0.08])
@@ -27,6 +25,15 @@ IRIS_COLOURS = {
     "blue": (0.10, 0.18, 0.30),
     "grey": (0.19, 0.21, 0.22),
 }
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What a look depends on."""
+
+    years: float  # age, years
+    male: float  # 0 female to 1 male
+    ancestry: tuple[float, ...]  # shares of `makehuman.ANCESTRIES`, sum 1
 
 
 @dataclass(frozen=True)
@@ -56,17 +63,17 @@ class Look:
     seed: int  # of the fine noise
 
 
-def sample_look(random: np.random.Generator, identity: Identity, has_hair: bool) -> Look:
-    """Colours and details that go with an identity's age, sex and ancestry."""
-    share = np.array(identity.ancestry)
+def sample_look(random: np.random.Generator, traits: Traits, has_hair: bool) -> Look:
+    """Colours and details that go with age, sex and ancestry."""
+    share = np.array(traits.ancestry)
     melanin = float(np.clip(share @ MELANIN + random.normal(0, 0.1), 0, 1))
-    hair_name = _hair_name(random, identity)
+    hair_name = _hair_name(random, traits)
     spread = np.exp(random.normal(0, 0.18) + random.normal(0, 0.05, 3))
     light_eyes = share[2] * 0.75
     iris_name = str(random.choice(["blue", "green", "hazel", "grey"])) if random.random() < light_eyes else "brown"
     if iris_name == "brown" and random.random() < share[0] + share[1]:
         iris_name = "dark brown"
-    male = identity.male > 0.5
+    male = traits.male > 0.5
     lipstick = None
     if not male and random.random() < 0.3:
         lipstick = tuple(float(c) for c in np.array([0.42, 0.05, 0.07]) * np.exp(random.normal(0, [0.3, 0.4, 0.3])))
@@ -95,11 +102,11 @@ def sample_look(random: np.random.Generator, identity: Identity, has_hair: bool)
     )
 
 
-def _hair_name(random, identity):
-    grey = np.clip((identity.years - 42) / 35, 0, 1)
+def _hair_name(random, traits):
+    grey = np.clip((traits.years - 42) / 35, 0, 1)
     if random.random() < grey:
-        return str(random.choice(["grey", "white"], p=[0.7, 0.3] if identity.years < 70 else [0.4, 0.6]))
-    if random.random() < identity.ancestry[0] + identity.ancestry[1]:
+        return str(random.choice(["grey", "white"], p=[0.7, 0.3] if traits.years < 70 else [0.4, 0.6]))
+    if random.random() < traits.ancestry[0] + traits.ancestry[1]:
         return str(random.choice(["black", "dark brown", "brown"], p=[0.6, 0.3, 0.1]))
     names = ["black", "dark brown", "brown", "light brown", "blond", "red"]
     return str(random.choice(names, p=[0.08, 0.24, 0.26, 0.16, 0.18, 0.08]))

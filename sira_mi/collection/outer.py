@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from sira_mi.collection.render import Part, blocked_along
 from sira_mi.collection.skin import HAIR
+from sira_mi.collection.subject import BrokenHead
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 
 DIRECTIONS = 64
@@ -152,7 +153,7 @@ def choose_points(
     wanted = round(face_share * count)
     wanted = int(np.clip(wanted, count - len(outside), len(inside)))
     if count - wanted > len(outside) or wanted < 0:
-        raise ValueError(f"only {len(wide.points)} visible surface points")
+        raise BrokenHead(f"only {len(wide.points)} visible surface points")
     chosen = np.concatenate(
         [random.choice(inside, wanted, replace=False), random.choice(outside, count - wanted, replace=False)]
     )

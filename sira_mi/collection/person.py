@@ -1,4 +1,4 @@
-"""One synthetic person: identity, look and hair, drawn from a seed, as closed surfaces with materials."""
+"""One synthetic person: look, clothes and hair on a head of the MakeHuman topology, as surfaces with materials."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from sira_mi.collection import hair as hairs
 from sira_mi.collection import skin
-from sira_mi.collection.look import Look, sample_look
-from sira_mi.collection.makehuman import Identity, identity_vertices, sample_identity
+from sira_mi.collection.look import Look, Traits, sample_look
+from sira_mi.collection.makehuman import identity_vertices, sample_identity
 from sira_mi.collection.render import Part
 from sira_mi.collection.surface import eye_spheres, unit_eye, vertex_normals
 
@@ -46,7 +46,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Person:
-    identity: Identity
+    traits: Traits
     look: Look
     cut: Cut | None
     control: np.ndarray  # [19158, 3] base-mesh vertices, scene units
@@ -55,7 +55,7 @@ class Person:
 
     def description(self) -> dict:
         """JSON types: everything drawn."""
-        return {"identity": asdict(self.identity), "look": asdict(self.look), "hair": self.cut and asdict(self.cut)}
+        return {"traits": asdict(self.traits), "look": asdict(self.look), "hair": self.cut and asdict(self.cut)}
 
 
 def sample_cut(random: np.random.Generator, names: list[str], male: float) -> Cut:
@@ -69,15 +69,20 @@ def sample_cut(random: np.random.Generator, names: list[str], male: float) -> Cu
 
 
 def make_person(seed: int, hair_folder: Path | None) -> Person:
-    """The person of a seed."""
+    """The MakeHuman person of a seed."""
     random = np.random.default_rng([seed, 1])
     identity = sample_identity(random)
+    traits = Traits(identity.years, identity.male, identity.ancestry)
+    return dress(identity_vertices(identity), traits, random, hair_folder)
+
+
+def dress(control: np.ndarray, traits: Traits, random: np.random.Generator, hair_folder: Path | None) -> Person:
+    """A person of control vertices [19158, 3] in scene units, with a look, clothes and, often, hair."""
     cut = None
     wears = random.random() < HAIR_SHARE
     if hair_folder is not None and wears:
-        cut = sample_cut(random, hairs.list_hair(hair_folder), identity.male)
-    look = sample_look(random, identity, cut is not None)
-    control = identity_vertices(identity)
+        cut = sample_cut(random, hairs.list_hair(hair_folder), traits.male)
+    look = sample_look(random, traits, cut is not None)
     head, triangles, cloth = skin.body_under(control, look)
     volume = None
     covered = np.zeros(len(head))
@@ -93,7 +98,7 @@ def make_person(seed: int, hair_folder: Path | None) -> Person:
         parts.append(Part(centre + radius * unit, eye_triangles, unit, eye_albedo, eye_specular, code))
     if volume is not None:
         parts.append(volume)
-    return Person(identity, look, cut, control, head, parts)
+    return Person(traits, look, cut, control, head, parts)
 
 
 def _wear(cut, folder, control, head, look, random):

@@ -16,7 +16,7 @@ ROUGHNESS = 0.5
 @dataclass(frozen=True)
 class RenderSettings:
     size: int = 160  # pixels, width and height of a view
-    samples: int = 40  # paths a pixel
+    samples: int = 20  # paths a pixel
     depth: int = 4  # path length, bounces
     frontal_luminance: tuple[float, float] = (0.22, 0.4)  # mean linear luminance of the head in the frontal view
 
@@ -138,6 +138,26 @@ def render_views(
     channels = [dr.block_sum(channel, samples) / samples for channel in channels]
     image = np.stack([np.array(c) for c in channels], axis=-1).reshape(views, size, size, 4)
     return image[..., :3], np.clip(image[..., 3], 0, 1)
+
+
+def render_albedo(
+    scene: mi.Scene, intrinsics: np.ndarray, poses: np.ndarray, settings: RenderSettings, grid: int = 3
+) -> tuple[np.ndarray, np.ndarray]:
+    """Diffuse albedo [V, H, W, 3] and specular strength [V, H, W] of what the cameras see, the mean of `grid`² places
+    of each pixel; 0 where they see nothing."""
+    views, size = len(poses), settings.size
+    index = dr.arange(mi.UInt32, views * size * size * grid * grid)
+    sub, pixel = index % (grid * grid), index // (grid * grid)
+    x = mi.Float(pixel % size) + (mi.Float(sub % grid) + 0.5) / grid
+    y = mi.Float(pixel // size % size) + (mi.Float(sub // grid) + 0.5) / grid
+    hit = scene.ray_intersect(_camera_ray(intrinsics, poses, pixel // (size * size), x, y))
+    albedo = hit.shape.eval_attribute_3("vertex_albedo", hit, hit.is_valid())
+    specular = hit.shape.eval_attribute_1("vertex_specular", hit, hit.is_valid())
+    channels = [dr.select(hit.is_valid(), c, 0) for c in (*albedo, specular)]
+    dr.eval(channels)
+    means = [np.array(dr.block_sum(c, grid * grid)) / grid**2 for c in channels]
+    image = np.stack(means, axis=-1).reshape(views, size, size, 4)
+    return image[..., :3], image[..., 3]
 
 
 def _camera_ray(intrinsics, poses, view, x, y):

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sira_mi.collection.landmarks import mesh_landmarks
 from sira_mi.collection.lighting import sample_light
 from sira_mi.collection.outer import (
     Samples,
@@ -19,7 +18,6 @@ from sira_mi.collection.outer import (
     seen_from_afar,
     smooth_hair_normals,
 )
-from sira_mi.collection.person import make_person
 from sira_mi.collection.render import (
     RenderSettings,
     blocked_along,
@@ -28,13 +26,14 @@ from sira_mi.collection.render import (
     camera_position,
     exposure,
     project,
+    render_albedo,
     render_views,
     sample_cameras,
 )
 from sira_mi.collection.skin import CLOTH
-from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
+from sira_mi.collection.subject import BrokenHead, Subject
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMINANCE
 
-LICENCE = "CC0-1.0 (MakeHuman base mesh, targets and hair; procedural appearance)"
 NOSE_TIP = 1  # landmark index
 
 LAYOUT = {
@@ -53,7 +52,9 @@ LAYOUT = {
     "landmarks_valid": "[468] bool",
     "albedo": "[P, 3] f2, true linear diffuse albedo (for evaluation only)",
     "specular": "[P] f2, true specular strength, reflectance at normal incidence / 0.08 (for evaluation only)",
-    "info": "JSON text: seed, identity, look, hair, light, licence",
+    "albedo_images": "[2, H, W, 3] f2, true linear diffuse albedo of `HELD_OUT_VIEWS`, 0 outside (for evaluation only)",
+    "specular_images": "[2, H, W] f2, true specular strength of `HELD_OUT_VIEWS`, 0 outside (for evaluation only)",
+    "info": "JSON text: name, source, seed, group, person, light, licence",
 }
 
 
@@ -98,19 +99,22 @@ def visible_colors(scene, samples: Samples, cameras, images: np.ndarray, coverag
     return visible, colors
 
 
-def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSettings | None = None) -> dict:
-    """The arrays of `LAYOUT` for one person under one light."""
+def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSettings | None = None) -> dict:
+    """The arrays of `LAYOUT` for one subject under one light, which `seed` draws from lobes, sky and `hdri`.
+
+    Raises BrokenHead when too little of the subject's surface can be seen."""
     settings = settings or SceneSettings()
     random = np.random.default_rng([seed, 2])
-    person = make_person(seed, hair)
     light, light_info = sample_light(random, hdri)
-    landmarks, landmarks_valid = mesh_landmarks(person.head)
-    nose = landmarks[NOSE_TIP] if landmarks_valid[NOSE_TIP] else person.head[np.argmax(person.head[:, 2])]
-    scene = build_scene(person.parts, light, settings.render)
+    landmarks, landmarks_valid = subject.landmarks, subject.landmarks_valid
+    if not landmarks_valid[NOSE_TIP]:
+        raise BrokenHead("the nose tip has no landmark")
+    nose = landmarks[NOSE_TIP]
+    scene = build_scene(subject.parts, light, settings.render)
 
     cameras = sample_cameras(random, settings.render.size)
     images, coverage = render_views(scene, *cameras, settings.render, seed)
-    wide = sample_parts(person.parts, 4 * settings.points, nose, random)
+    wide = sample_parts(subject.parts, 4 * settings.points, nose, random)
     wide = wide.take(np.flatnonzero(seen_from_afar(scene, wide.points, wide.normals)))
     samples = choose_points(wide, nose, settings.points, settings.face_share, random)
     target = random.uniform(*settings.render.frontal_luminance) * metering(samples)
@@ -118,6 +122,9 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
     images = images * scale
     light_info["scale"] = scale
     visible, colors = visible_colors(scene, samples, cameras, images, coverage)
+
+    held_out = list(HELD_OUT_VIEWS)
+    albedo_images, specular_images = render_albedo(scene, cameras[0][held_out], cameras[1][held_out], settings.render)
 
     half = settings.volume // 2
     uniform = random.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (settings.volume - half, 3))
@@ -128,10 +135,12 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
     distance = np.where(seen_from_afar(scene, volume, None), distance, -distance)
 
     info = {
+        "name": subject.name,
         "seed": seed,
-        "person": person.description(),
+        "group": subject.group,
+        "person": subject.description,
         "light": light_info,
-        "licence": LICENCE,
+        "licence": subject.licence,
         "frontal_luminance": target,
     }
     return {
@@ -150,6 +159,8 @@ def make_scene(seed: int, hair: Path | None, hdri: list[Path], settings: SceneSe
         "landmarks_valid": landmarks_valid & _landmarks_uncovered(scene, landmarks),
         "albedo": samples.albedo.astype(np.float16),
         "specular": samples.specular.astype(np.float16),
+        "albedo_images": albedo_images.astype(np.float16),
+        "specular_images": specular_images.astype(np.float16),
         "info": np.array(json.dumps(info)),
     }
 

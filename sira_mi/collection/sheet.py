@@ -17,8 +17,9 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def contact_sheet(folder: Path, count: int = 24, columns: int = 6, views: tuple[int, ...] = (0,)) -> np.ndarray:
-    """The chosen views of the first scenes as one 8-bit image; a scene's views lie below one another."""
-    paths = sorted(folder.glob("scene_*.npz"))[:count]
+    """The chosen views of scenes spread over the folder as one 8-bit image; a scene's views lie below one another."""
+    paths = sorted(folder.glob("*.npz"))
+    paths = paths[:: max(1, len(paths) // count)][:count]
     if not paths:
         raise InputError(f"{folder}: no scenes found")
     tiles = [np.concatenate(list(load_scene(path)["images"][list(views)]), axis=0) for path in paths]

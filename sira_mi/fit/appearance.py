@@ -35,7 +35,6 @@ class AppearanceProblem:
         keep = portrait.mask[points["row"], points["column"]] > 0.5
         self.columns = {k: np.ascontiguousarray(v[:, keep]) for k, v in points.items() if k not in ("row", "column")}
         self.target = np.ascontiguousarray(portrait.image[points["row"], points["column"]][keep].T, dtype=np.float32)
-        self.z_l_prior = avatar.tensors["z_l"]
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's
@@ -79,7 +78,7 @@ class AppearanceProblem:
         )
         terms = {
             "embedding": weights.embedding
-            * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"] - mi.Float(self.z_l_prior))),
+            * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"])),
             "white_light": weights.white_light * _chroma(lobes),
         }
         diffuse = base_diffuse

@@ -25,7 +25,7 @@ class GeometryWeights:
     mask: float = 2.0  # on a mean over rays, in scene units
     eikonal: float = 0.05
     landmark: float = 0.4  # on reprojection errors in face sizes
-    embedding: float = 2e-4  # on ‖z‖², keeps latents where the prior was trained
+    embedding: float = 6e-6  # on ‖z‖², keeps latents where the prior was trained
     stay: float = 0.5  # on mean |δ − δ₀| against the prior's deformation network
 
 
@@ -36,7 +36,7 @@ class AppearanceWeights:
     lambda_8: float = 0.5  # eq. 13, refinement in shadows
     lambda_9: float = 1.0  # eq. 13, refinement in reflections
     refinement: float = 0.05  # eq. 12
-    embedding: float = 3e-4  # on ‖z‖²
+    embedding: float = 1e-5  # on ‖z‖²
     white_light: float = 0.02  # mean squared log-chroma of the lobes: the prior on the light's colour
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
 
@@ -66,15 +66,15 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
     return (
-        (GEOMETRY, Stage("latents", steps(160), dict.fromkeys(shape, 1e-2), mask_sharpness=30)),
-        (GEOMETRY, Stage("networks", steps(240), _rates(shape, 1e-3, networks, 4e-4), mask_sharpness=60)),
-        (GEOMETRY, Stage("details", steps(120), _rates(shape, 3e-4, networks, 1.5e-4), mask_sharpness=240)),
-        (APPEARANCE, Stage("light", steps(120), {"z_l": 2e-2, "illumination": 1e-3})),
-        (APPEARANCE, Stage("albedo", steps(120), {"z_l": 5e-3, "illumination": 5e-4, "z_a": 2e-2})),
+        (GEOMETRY, Stage("latents", steps(160), dict.fromkeys(shape, 6e-2), mask_sharpness=30)),
+        (GEOMETRY, Stage("networks", steps(240), _rates(shape, 6e-3, networks, 4e-4), mask_sharpness=60)),
+        (GEOMETRY, Stage("details", steps(120), _rates(shape, 2e-3, networks, 1.5e-4), mask_sharpness=240)),
+        (APPEARANCE, Stage("light", steps(120), {"z_l": 1e-1, "illumination": 1e-3})),
+        (APPEARANCE, Stage("albedo", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 1e-1})),
         (
             APPEARANCE,
             Stage(
-                "speculars", steps(120), {"z_l": 5e-3, "illumination": 5e-4, "z_a": 5e-3, "z_s": 1e-2}, k_s=(0.0, 1.0)
+                "speculars", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 3e-2, "z_s": 6e-2}, k_s=(0.0, 1.0)
             ),
         ),
         (
@@ -82,7 +82,7 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
             Stage(
                 "refinement",
                 steps(800),
-                {"z_l": 1e-3, "illumination": 1e-4, "z_s": 2e-3, "albedo_refinement": 5e-3},
+                {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3},
                 k_s=(1.0, 1.0),
                 k_r=1.0,
             ),

@@ -22,17 +22,25 @@ def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def whitened(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Network parameters that take a standard normal latent z for what `mean + spread z` was: in every layer Z mean is
-    added to the bias, and Z spread takes the place of Z."""
+    """Network parameters that take a standard normal latent z for what `mean + spread z` was. A latent that shifts
+    hidden layers: in each of them Z mean is added to the bias, and Z spread takes the place of Z. A latent that is the
+    network's input (the illumination decoder's): the same in the first layer, with its weights."""
     flat, offset = network.copy(), 0
-    for weight, bias, latent in architecture.networks[name].shapes():
+    for k, (weight, bias, latent) in enumerate(architecture.networks[name].shapes()):
         start_bias = offset + weight[0] * weight[1]
         start_latent = start_bias + bias[0]
-        offset = start_latent + latent[0] * latent[1]
+        end = start_latent + latent[0] * latent[1]
         if latent[1]:
-            matrix = flat[start_latent:offset].reshape(latent)
+            mixed, shape = slice(start_latent, end), latent
+        elif k == 0 and name == "illumination":
+            mixed, shape = slice(offset, start_bias), weight
+        else:
+            mixed = None
+        if mixed is not None:
+            matrix = flat[mixed].reshape(shape)
             flat[start_bias:start_latent] += matrix @ mean
-            flat[start_latent:offset] = (matrix @ spread).ravel()
+            flat[mixed] = (matrix @ spread).ravel()
+        offset = end
     return flat
 
 
@@ -44,11 +52,16 @@ def assemble_prior(
     roughness: float,
     seed: int,
 ) -> Avatar:
-    """The mean head of both trained models. The latents of shape, radiance and albedo become standard normal: the zero
-    latent is the mean of the trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean
-    light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
+    """The mean head of both trained models. All latents become standard normal: the zero latent is the mean of the
+    trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
     that have them."""
-    owners = {"z_sdf": "deformation", "z_r": "rendering", "z_a": "diffuse_albedo", "z_s": "specular_albedo"}
+    owners = {
+        "z_sdf": "deformation",
+        "z_r": "rendering",
+        "z_a": "diffuse_albedo",
+        "z_s": "specular_albedo",
+        "z_l": "illumination",
+    }
     tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {
         name: appearance[name] for name in NETWORKS_OF_APPEARANCE
     }
@@ -57,7 +70,6 @@ def assemble_prior(
         tensors[network] = whitened(architecture, network, tensors[network], *whitening(latents[name]))
     for name, size in architecture.latents.items():
         tensors[name] = np.zeros(size, np.float32)
-    tensors["z_l"] = latents["z_l"].mean(axis=1)
     rng = np.random.default_rng([seed, 4])
     refinement = architecture.networks["albedo_refinement"]
     tensors["albedo_refinement"] = initial_parameters(refinement, rng, output_scale=0.0)
