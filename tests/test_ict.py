@@ -1,5 +1,5 @@
-"""ICT-FaceKit identities on the MakeHuman topology, on a made-up basis file: another MakeHuman head, warped and cut open
-as the scans are, with known modes. And the pure registration functions against references."""
+"""ICT-FaceKit identities on the MakeHuman topology, on a made-up basis file: another MakeHuman head, warped and cut
+open as the scans are, with known modes. And the pure registration functions against references."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
@@ -131,7 +131,8 @@ def test_shoulders_stay(heads):
 
 
 def test_eyes_sit_behind_the_lids(made_up, heads):
-    """Eyeballs are the file's, scaled down at most a little, and no lid is behind their surface."""
+    """Eyeballs are the file's, and no lid is behind their surface. The warp leaves no perfect balls and bends the lids
+    towards them, so that they are scaled down more than those of scans."""
     expected = truth(made_up, COEFFICIENTS)
     shift = (expected - head_surface(heads["moved"])[0])[face_mask()].mean(0)
     vertices = (made_up["arrays"]["mean"] + np.tensordot(COEFFICIENTS, made_up["arrays"]["basis"], 1)) / 10
@@ -140,8 +141,8 @@ def test_eyes_sit_behind_the_lids(made_up, heads):
     for k, (centre, radius) in enumerate(eye_spheres(heads["moved"])):
         start = made_up["skin"] + k * count
         ball, size = registration.fit_sphere(vertices[start : start + count])
-        assert np.linalg.norm(centre + shift - ball) * MILLIMETRES_PER_UNIT < 1.0
-        assert 0.93 * size < radius < 1.01 * size
+        assert np.linalg.norm(centre + shift - ball) * MILLIMETRES_PER_UNIT < 2.0
+        assert 0.85 * size < radius < 1.01 * size
         assert np.linalg.norm(refined[ict._lids()[k]] - centre, axis=1).min() > radius
     assert heads["moved"][LEFT_EYE][:, 0].min() > 0
 
@@ -264,23 +265,18 @@ def test_similarity_is_recovered():
     np.testing.assert_allclose(shift, [1, -2, 3], atol=1e-12)
 
 
-def test_biharmonic_energy_is_that_of_a_quadratic():
-    """On an uneven planar mesh the energy of x² + y², whose Laplacian is 4, is 16 times the area away from the border,
-    and that of a linear function is nothing."""
-    random = np.random.default_rng(2)
-    n = 24
+def test_biharmonic_energy_is_the_squared_laplacians_integral():
+    """On an uneven planar mesh: sin²πx sin²πy, flat at the border, whose energy over the unit square is 2π⁴."""
+    random, n = np.random.default_rng(2), 32
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), np.zeros(n * n)], 1)
     inner = (np.abs(points[:, :2] - 0.5) < 0.499).all(1)
     points[inner, :2] += random.uniform(-0.1, 0.1, (inner.sum(), 2)) / n
     k = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     energy = registration.biharmonic(points, np.stack([k, k + n, k + n + 1, k + 1], 1))
-    # Values that vanish near the border see the inside only.
-    middle = np.prod(np.clip(np.minimum(points[:, :2], 1 - points[:, :2]) - 0.08, 0, None), axis=1) > 0
-    window = 1.0 * middle
-    linear, quadratic = points @ [2.0, -1.0, 0], (points**2).sum(1)
-    assert abs(window @ (energy @ linear)) < 1e-6 * np.abs(energy).dot(np.abs(linear)).max()
-    assert 0 < quadratic @ (energy @ quadratic)
+    bump = (np.sin(np.pi * points[:, :2]) ** 2).prod(1)
+    assert abs(bump @ (energy @ bump) / (2 * np.pi**4) - 1) < 0.02
+    assert abs(energy @ np.ones(n * n)).max() < 1e-6
 
 
 def test_rings_are_matched_by_arc_length():

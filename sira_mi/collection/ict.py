@@ -56,11 +56,11 @@ LID_SHARE = 1.3  # radii of the eyeball around its centre within which marks giv
 EYE_GAP = 0.003  # scene units that the lids stay clear of the eyeballs
 
 LEVELS = (
-    Level(stiffness=1.0, reach=0.4, normal_weight=0.3, pair_weight=1.0, iterations=3),
-    Level(stiffness=0.5, reach=0.3, normal_weight=0.25, pair_weight=0.5, iterations=3),
-    Level(stiffness=0.25, reach=0.2, normal_weight=0.2, pair_weight=0.2, iterations=4),
-    Level(stiffness=0.12, reach=0.15, normal_weight=0.15, pair_weight=0.1, iterations=4),
-    Level(stiffness=0.06, reach=0.1, normal_weight=0.1, pair_weight=0.05, iterations=4),
+    Level(stiffness=1.0, reach=0.4, normal_weight=0.3, pair_weight=1.0, iterations=2),
+    Level(stiffness=0.5, reach=0.3, normal_weight=0.25, pair_weight=0.5, iterations=2),
+    Level(stiffness=0.25, reach=0.2, normal_weight=0.2, pair_weight=0.2, iterations=3),
+    Level(stiffness=0.12, reach=0.15, normal_weight=0.15, pair_weight=0.1, iterations=3),
+    Level(stiffness=0.06, reach=0.1, normal_weight=0.1, pair_weight=0.05, iterations=3),
     Level(stiffness=0.035, reach=0.06, normal_weight=0.1, pair_weight=0.03, iterations=4),
 )
 MARK_AREA, LID_AREA, SOCKET_AREA, BODY_AREA = 0.004, 0.002, 0.0005, 0.01  # square scene units a row stands for

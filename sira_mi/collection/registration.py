@@ -20,7 +20,7 @@ from sira_mi.collection.surface import vertex_normals
 CANDIDATES = 6
 # Cosine between normals under which a pair is dropped, and from which it counts fully.
 COMPATIBLE = (0.3, 0.75)
-SMALLEST_COTANGENT = 0.02
+LARGEST_COTANGENT = 8.0  # keeps slivers from stiffening the mesh
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def biharmonic(vertices: np.ndarray, quads: np.ndarray) -> sparse.csc_matrix:
     for k in range(3):
         i, j = first[:, (k + 1) % 3], first[:, (k + 2) % 3]
         cotangent = _dot(corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]) / twice_area
-        half = 0.25 * np.maximum(cotangent, SMALLEST_COTANGENT)
+        half = 0.25 * np.clip(cotangent, -LARGEST_COTANGENT, LARGEST_COTANGENT)
         laplacian = laplacian + sparse.csr_matrix(
             (
                 np.concatenate([half, half, -half, -half]),
