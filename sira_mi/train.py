@@ -1,42 +1,129 @@
 """`python -m sira_mi.train shape|appearance --collection DIR --out DIR`: trains the statistical models on a collection.
 
 `shape` trains the SA-SM and writes `shape.checkpoint`; `appearance` trains the AF-SM on top of it and writes
-`prior.safetensors`, which a fit takes with `--prior`. Both resume from their checkpoints.
+`prior.safetensors`, which a fit takes with `--prior`. Both write a log and pictures, and resume from their checkpoints.
 """
 
 import argparse
 import dataclasses
+import json
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError, run_command
+from sira_mi.models.avatar import AvatarArchitecture
+
+# The loss terms of each model whose weight λ is a setting of that name.
+SHAPE_TERMS = ("surface", "normal", "distance", "eikonal", "deformation", "landmark", "color", "embedding")
+APPEARANCE_TERMS = ("embedding", "smoothness", "specular_anchor", "white_light", "skin_tone")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m sira_mi.train", description=__doc__.split("\n")[0])
     parser.add_argument("model", choices=("shape", "appearance"))
     parser.add_argument("--collection", type=Path, required=True, help="folder of python -m sira_mi.collection build")
-    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, logs and the prior")
+    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, logs, pictures and the prior")
     parser.add_argument("--steps", type=int, help="number of steps (default: the model's)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--without", metavar="TERM", help="loss term to leave out: its weight becomes zero")
+    parser.add_argument(
+        "--architecture",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="sizes of the networks, e.g. sdf_width=64 (default: those of AvatarArchitecture)",
+    )
+    parser.add_argument("--picture-steps", type=int, default=1000, metavar="N", help="steps between pictures")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     arguments = parser.parse_args()
+    if (arguments.steps is not None and arguments.steps < 1) or arguments.picture_steps < 1:
+        raise InputError("--steps and --picture-steps are at least 1")
     mi.set_variant(arguments.variant)
     train = train_shape if arguments.model == "shape" else train_appearance
-    train(arguments.collection, arguments.out, arguments.steps, arguments.seed)
+    train(
+        arguments.collection,
+        arguments.out,
+        steps=arguments.steps,
+        seed=arguments.seed,
+        without=arguments.without,
+        sizes=parse_sizes(arguments.architecture),
+        picture_steps=arguments.picture_steps,
+    )
 
 
-def train_shape(collection: Path, out: Path, steps: int | None, seed: int) -> dict[str, np.ndarray]:
-    """Trains the SA-SM; returns its networks and latents [dim, scenes]."""
+def parse_sizes(items: list[str]) -> dict[str, int]:
+    """`["sdf_width=64", ...]` as sizes of an AvatarArchitecture. Raises InputError for anything else."""
+    names, sizes = [field.name for field in dataclasses.fields(AvatarArchitecture)], {}
+    for item in items:
+        name, _, value = item.partition("=")
+        if name not in names:
+            raise InputError(f"--architecture {item}: unknown size {name!r}; known are {', '.join(names)}")
+        if not value.isascii() or not value.isdigit():
+            raise InputError(f"--architecture {item}: give a whole number, e.g. {name}=64")
+        sizes[name] = int(value)
+    return sizes
+
+
+def with_sizes(architecture: AvatarArchitecture, sizes: dict[str, int]) -> AvatarArchitecture:
+    """The architecture with some sizes replaced. Raises InputError for sizes that no network can have."""
+    try:
+        changed = dataclasses.replace(architecture, **sizes)
+        _ = changed.networks  # refuses networks that are too large
+        return changed
+    except ValueError as error:
+        raise InputError(f"--architecture: {error}") from error
+
+
+def without_term(settings, terms: tuple[str, ...], without: str | None):
+    """Settings of a training with the weight of the loss term `without` set to zero. Raises InputError for an unknown
+    term."""
+    if without is None:
+        return settings
+    if without not in terms:
+        raise InputError(f"--without {without}: no such loss term; known are {', '.join(terms)}")
+    return dataclasses.replace(settings, **{without: 0.0})
+
+
+def read_architecture(metadata: dict[str, str], checkpoint: Path) -> AvatarArchitecture:
+    """The architecture that a training's checkpoint holds. Raises InputError when there is none."""
+    try:
+        return AvatarArchitecture(**json.loads(metadata["architecture"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{checkpoint} does not say its architecture ({error}); train it again") from error
+
+
+def describe(architecture: AvatarArchitecture, settings, seed: int) -> dict[str, str]:
+    """What a resumed training must have in common with the one that it continues: all but the number of steps."""
+    values = {k: v for k, v in dataclasses.asdict(settings).items() if k != "steps"}
+    return {
+        "architecture": json.dumps(dataclasses.asdict(architecture), sort_keys=True),
+        "settings": json.dumps({**values, "seed": seed}, sort_keys=True),
+    }
+
+
+def train_shape(
+    collection: Path,
+    out: Path,
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    without: str | None = None,
+    sizes: dict[str, int] | None = None,
+    picture_steps: int = 1000,
+) -> dict[str, np.ndarray]:
+    """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
+    `sizes` the sizes that differ from AvatarArchitecture's."""
     from sira_mi.models import sa_sm
-    from sira_mi.models.avatar import AvatarArchitecture
     from sira_mi.models.optimisation import adam
+    from sira_mi.models.pictures import shape_picture
     from sira_mi.models.scenes import load_training_scenes
+    from sira_mi.models.shape_model import ShapeModel
     from sira_mi.models.training import run_training
 
-    architecture, settings = AvatarArchitecture(), sa_sm.ShapeTraining()
+    architecture = with_sizes(AvatarArchitecture(), sizes or {})
+    settings = without_term(sa_sm.ShapeTraining(), SHAPE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
     scenes = load_training_scenes(collection)
@@ -47,25 +134,62 @@ def train_shape(collection: Path, out: Path, steps: int | None, seed: int) -> di
         batch = sa_sm.draw_batch(scenes, settings, np.random.default_rng([seed, 2, number]))
         return sa_sm.training_step(architecture, settings, optimizer, batch)
 
-    return run_training(out, "shape", settings.steps, optimizer, lambda k: sa_sm.rates(settings, k), step)
+    def picture(path: Path, parameters: dict[str, np.ndarray]) -> None:
+        model = ShapeModel.of_training(architecture, parameters)
+        shape_picture(path, model, parameters["z_sdf"], scenes, seed)
+
+    return run_training(
+        out,
+        "shape",
+        settings.steps,
+        optimizer,
+        lambda k: sa_sm.rates(settings, k),
+        step,
+        weights={name: getattr(settings, name) for name in SHAPE_TERMS},
+        description=describe(architecture, settings, seed),
+        picture=picture,
+        picture_steps=picture_steps,
+    )
 
 
-def train_appearance(collection: Path, out: Path, steps: int | None, seed: int) -> None:
-    """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`; writes `out/prior.safetensors`."""
+def train_appearance(
+    collection: Path,
+    out: Path,
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    without: str | None = None,
+    sizes: dict[str, int] | None = None,
+    picture_steps: int = 1000,
+) -> None:
+    """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`, whose architecture it takes over; writes
+    `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only."""
     from sira_mi.models import af_sm
-    from sira_mi.models.avatar import AvatarArchitecture, save_avatar
-    from sira_mi.models.optimisation import adam, read_arrays
+    from sira_mi.models.avatar import save_avatar
+    from sira_mi.models.optimisation import adam
+    from sira_mi.models.pictures import AppearancePicture
     from sira_mi.models.prior import assemble_prior
     from sira_mi.models.scenes import load_training_scenes
-    from sira_mi.models.training import run_training
+    from sira_mi.models.shape_model import LATENTS, NETWORKS, ShapeModel
+    from sira_mi.models.training import run_training, trained_parameters
 
-    architecture, settings = AvatarArchitecture(), af_sm.AppearanceTraining()
+    checkpoint = out / "shape.checkpoint"
+    if not checkpoint.exists():
+        raise InputError(f"{checkpoint} is missing; run python -m sira_mi.train shape first")
+    shape, metadata = trained_parameters(checkpoint)
+    trained = read_architecture(metadata, checkpoint)
+    architecture = with_sizes(trained, sizes or {})
+    frozen_sizes = ("features", "sdf_", "rendering_")
+    for name in sizes or {}:
+        if name.startswith(frozen_sizes) and getattr(trained, name) != getattr(architecture, name):
+            raise InputError(f"--architecture: {checkpoint} was trained with {name}={getattr(trained, name)}")
+    settings = without_term(af_sm.AppearanceTraining(), APPEARANCE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
     scenes = load_training_scenes(collection)
-    state, _ = read_arrays(out / "shape.checkpoint")
-    shape = {name.removesuffix("/value"): value for name, value in state.items() if name.endswith("/value")}
-    if shape["z_sdf"].shape[1] != len(scenes):
+    if any(shape[name].shape != (architecture.networks[name].parameters,) for name in NETWORKS):
+        raise InputError(f"{checkpoint} does not fit its architecture; train it again")
+    if any(shape[name].shape != (architecture.latents[name], len(scenes)) for name in LATENTS):
         raise InputError(f"{out} was trained on {shape['z_sdf'].shape[1]} scenes, {collection} has {len(scenes)}")
     frozen = [
         af_sm.freeze_scene(
@@ -80,7 +204,19 @@ def train_appearance(collection: Path, out: Path, steps: int | None, seed: int) 
         batch = af_sm.draw_batch(frozen, settings, np.random.default_rng([seed, 3, number]))
         return af_sm.training_step(architecture, settings, optimizer, batch)
 
-    appearance = run_training(out, "appearance", settings.steps, optimizer, lambda k: af_sm.rates(settings, k), step)
+    model = ShapeModel.of_training(architecture, shape)
+    appearance = run_training(
+        out,
+        "appearance",
+        settings.steps,
+        optimizer,
+        lambda k: af_sm.rates(settings, k),
+        step,
+        weights={name: getattr(settings, name) for name in APPEARANCE_TERMS},
+        description=describe(architecture, settings, seed),
+        picture=AppearancePicture(model, shape["z_sdf"], scenes, settings.roughness).write,
+        picture_steps=picture_steps,
+    )
     landmarks = np.stack([scene.landmarks for scene in scenes])
     save_avatar(
         out / "prior.safetensors", assemble_prior(architecture, shape, appearance, landmarks, settings.roughness, seed)

@@ -24,7 +24,7 @@ LATENTS = ("z_sdf", "z_r")
 class ShapeTraining:
     """Settings of the SA-SM training; λ as in eq. 7."""
 
-    steps: int = 12_000
+    steps: int = 10_000
     scenes: int = 32  # scenes a step
     surface_points: int = 96  # a scene and step
     volume_points: int = 32  # a scene and step
@@ -34,8 +34,8 @@ class ShapeTraining:
     initial_radius: float = 1.4  # of the reference sphere, scene units
     surface: float = 2.0  # L_Surf (NPHM)
     normal: float = 0.3  # normals of the scans (IGR, NPHM)
-    distance: float = 0.15  # signed distance of the volume points; takes the place of a free-space term
-    eikonal: float = 0.05  # λ1 (NPHM 0.1)
+    distance: float = 0.4  # signed distance of the volume points: clears other heads' hair from free space
+    eikonal: float = 0.2  # λ1 (NPHM 0.1), at surface and volume points
     deformation: float = 2e-3  # λ2 (i3DMM 1e-4, there on other units)
     landmark: float = 0.5  # λ3 (i3DMM 1.0)
     color: float = 0.25  # λ4 (i3DMM)
@@ -121,7 +121,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
     width = batch.points.shape[1] // batch.count
     everywhere = surface(field, batch.points)
     f, gradient, x_ref, gamma = (_columns_of(t, batch.count, 0, n) for t in everywhere)
-    f_volume, gradient_volume = (_columns_of(t, batch.count, n, width) for t in everywhere[:2])
+    f_volume = _columns_of(everywhere[0], batch.count, n, width)
     points = _columns_of(batch.points, batch.count, 0, n)
     rendering = layers(networks["rendering"], parameters["rendering"], z_r)
     octaves = architecture.rendering_octaves
@@ -130,7 +130,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         "surface": losses.surface_loss(f),
         "normal": losses.normal_loss(gradient, batch.normals),
         "distance": losses.distance_loss(f_volume, batch.volume_distance),
-        "eikonal": losses.eikonal_loss(gradient_volume),
+        "eikonal": losses.eikonal_loss(everywhere[1]),
         "deformation": losses.deformation_loss(x_ref - points, batch.count),
         "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
         "color": losses.photometric_loss(radiance, batch.colors),

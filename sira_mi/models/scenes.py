@@ -75,7 +75,7 @@ def load_training_scenes(folder: Path) -> list[TrainingScene]:
     """All scenes of the manifest's training split. Raises InputError when there are fewer than two."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
-        names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train"]
+        names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train" and "error" not in scene]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{folder} is not a collection: {error}; build one with python -m sira_mi.collection"

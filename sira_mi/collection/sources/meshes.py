@@ -111,30 +111,45 @@ def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def refine(surface: Surface, longest: Callable[[np.ndarray], np.ndarray], passes: int = 8) -> Surface:
-    """The surface with edges halved until none is longer than `longest(midpoints [E, 3]) -> [E]`. Both sides of a seam
-    are split alike."""
+    """The surface with edges halved until none is longer than `longest(midpoints [E, 3]) -> [E]`. With an edge, the
+    longest edge of its triangles is halved (after Rivara 1984), and both sides of a seam are split alike."""
+    index = place_index(surface.vertices)
     for _ in range(passes):
         triangles, count = surface.triangles, len(surface.vertices)
-        edges, _, edge = undirected_edges(triangles)
-        a, b = surface.vertices[edges[:, 0]], surface.vertices[edges[:, 1]]
-        split = np.linalg.norm(a - b, axis=1) > longest((a + b) / 2)
+        at = np.zeros((index.max() + 1, 3))
+        at[index] = surface.vertices
+        ends, _, side = undirected_edges(index[triangles])
+        a, b = at[ends[:, 0]], at[ends[:, 1]]
+        length = np.linalg.norm(a - b, axis=1)
+        split = length > longest((a + b) / 2)
         if not split.any() or len(triangles) > REFINED_TRIANGLES:
             break
+        farthest = side[np.arange(len(side)), length[side].argmax(1)]
+        while True:
+            marked = split.sum()
+            split[farthest[split[side].any(1)]] = True
+            if split.sum() == marked:
+                break
+        edges, _, edge = undirected_edges(triangles)
+        place = np.zeros(len(edges), int)
+        place[edge.ravel()] = side.ravel()
+        chosen = np.flatnonzero(split[place])
         middle = np.full(len(edges), -1)
-        middle[split] = count + np.arange(split.sum())
-        pick = edges[split]
+        middle[chosen] = count + np.arange(len(chosen))
+        index = np.concatenate([index, index.max() + 1 + place[chosen]])
+        pick = edges[chosen]
         surface = replace(
             surface,
-            triangles=_split(triangles, middle[edge]),
             **{
                 name: np.concatenate([getattr(surface, name), getattr(surface, name)[pick].mean(1)])
                 for name in ("vertices", "uv", "albedo")
             },
         )
+        surface = replace(surface, triangles=_split(triangles, middle[edge], surface.vertices))
     return surface
 
 
-def _split(triangles, middle):
+def _split(triangles, middle, vertices):
     """Triangles cut at the given vertices [T, 3] on their edges 01, 12, 20; -1 leaves an edge whole."""
     cut = middle >= 0
     number = cut.sum(1)
@@ -142,18 +157,22 @@ def _split(triangles, middle):
     first = np.where(number == 1, cut.argmax(1), np.where(number == 2, (~cut).argmax(1) + 1, 0)) % 3
     order = (first[:, None] + np.arange(3)) % 3
     t, m = np.take_along_axis(triangles, order, 1), np.take_along_axis(middle, order, 1)
+    columns = {"a": t[:, 0], "b": t[:, 1], "c": t[:, 2], "x": m[:, 0], "y": m[:, 1], "z": m[:, 2]}
+    two = number == 2
+    across = np.linalg.norm(vertices[columns["a"]] - vertices[columns["y"]], axis=1)
+    shorter = across < np.linalg.norm(vertices[columns["c"]] - vertices[columns["x"]], axis=1)
 
-    def pieces(wanted, *corners):
-        chosen = number == wanted
-        columns = {"a": t[:, 0], "b": t[:, 1], "c": t[:, 2], "x": m[:, 0], "y": m[:, 1], "z": m[:, 2]}
+    def pieces(chosen, *corners):
         return [np.stack([columns[name][chosen] for name in names], 1) for names in corners]
 
     return np.concatenate(
         [
             triangles[number == 0],
-            *pieces(1, "axc", "xbc"),
-            *pieces(2, "xby", "axy", "ayc"),
-            *pieces(3, "axz", "xby", "zyc", "xyz"),
+            *pieces(number == 1, "axc", "xbc"),
+            *pieces(two, "xby"),
+            *pieces(two & shorter, "axy", "ayc"),
+            *pieces(two & ~shorter, "axc", "xyc"),
+            *pieces(number == 3, "axz", "xby", "zyc", "xyz"),
         ]
     )
 
@@ -257,7 +276,8 @@ def classify(vertices: np.ndarray, triangles: np.ndarray, albedo: np.ndarray, la
     hairy = np.zeros(len(vertices), bool)
     way = crown - cheeks
     if np.linalg.norm(way) > BALD:
-        hairy = ((colour - cheeks) @ way > 0.45 * (way @ way)) & ~face & (vertices[:, 1] > chin - 0.5)
+        hairy = ((colour - cheeks) @ way > 0.45 * (way @ way)) & ~face
+        hairy &= (vertices[:, 1] > chin + 0.2) | ((vertices[:, 1] > chin - 0.5) & (vertices[:, 2] < -0.2))
     shoulders = (vertices[:, 1] < chin - 0.7) & (np.abs(vertices[:, 0]) > 0.9) & (vertices[:, 1] > DOMAIN_LOWER[1])
     clothed = np.zeros(len(vertices), bool)
     if shoulders.any():

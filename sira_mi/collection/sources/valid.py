@@ -46,6 +46,8 @@ ARRAYS = ("v", "f", "uv", "part", "part_names", "eye_l", "eye_r")
 BODY, WIG = "H_DDS_HighRes", "h_wig"
 EYES, GLANDS = ("h_L_eye", "h_R_eye"), ("h_L_gland", "h_R_gland")
 EYE_EDGE = 0.012  # scene units, longest edge of eyes and glands
+# Scene units from the middle over which the arms, which are stretched out sideways, start to turn down, and how far.
+ARM_START, ARM_END, ARM_TURN = 1.15, 2.05, 0.95
 ANCESTRIES = ("AIAN", "Asian", "Black", "Hispanic", "MENA", "NHPI", "White")
 SEXES = {"F": "female", "M": "male"}
 
@@ -74,7 +76,8 @@ class ValidSource:
         surfaces, eyes = read_avatar(path)
         rough = Similarity(UNITS_PER_METRE, np.eye(3), mean_eyes() - UNITS_PER_METRE * eyes)
         surfaces = {name: replace(s, vertices=rough(s.vertices)) for name, s in surfaces.items()}
-        body = refine(close_borders(surfaces[BODY], mean_eyes()[1] - 1.2), head_edges)
+        body = replace(surfaces[BODY], vertices=lower_arms(surfaces[BODY].vertices))
+        body = refine(close_borders(body, mean_eyes()[1] - 1.2), head_edges)
         small = {n: refine(surfaces[n], lambda m: np.full(len(m), EYE_EDGE)) for n in EYES + GLANDS}
         parts = [plain_part(body), *(plain_part(small[n], skin.EYE if n in EYES else skin.SKIN) for n in small)]
         wig = wig_part(surfaces[WIG], random) if WIG in surfaces else None
@@ -169,6 +172,23 @@ def _surface(vertices, triangles, uv, texture):
     return Surface(vertices[used].astype(float), corner.reshape(-1, 3), uv[used].astype(float), nothing, texture)
 
 
+def lower_arms(vertices: np.ndarray) -> np.ndarray:
+    """Vertices [N, 3] with both stretched-out arms turned down by up to `ARM_TURN` radians about the shoulders."""
+    out = vertices.copy()
+    for side in (1, -1):
+        across = side * vertices[:, 0]
+        arm = vertices[(across > 2.2) & (across < 2.9)]
+        if not len(arm):
+            continue
+        pivot = np.array([(ARM_START + ARM_END) / 2, np.median(arm[:, 1])])
+        turn = -ARM_TURN * skin.step(across, ARM_START, ARM_END)
+        x, y = across - pivot[0], vertices[:, 1] - pivot[1]
+        moved = across > ARM_START
+        out[moved, 0] = side * (pivot[0] + np.cos(turn) * x - np.sin(turn) * y)[moved]
+        out[moved, 1] = (pivot[1] + np.sin(turn) * x + np.cos(turn) * y)[moved]
+    return out
+
+
 def wig_part(wig: Surface, random: np.random.Generator) -> Part:
     """The closed volume around a wig's sheets, in the project's frame, with the sheets' colours."""
     points, uv = scatter(wig, hairs.SAMPLE_SPACING, random)
@@ -202,7 +222,8 @@ def scatter(surface: Surface, spacing: float, random: np.random.Generator) -> tu
 
 def _shade_scalp(head, wig, region, landmarks):
     """The head with the wig's colour on the scalp beneath and right beside it."""
-    distance, near = cKDTree(wig.vertices).query(head.vertices)
+    distance, near = cKDTree(wig.vertices).query(head.vertices, distance_upper_bound=0.17)
+    near = np.minimum(near, len(wig.vertices) - 1)
     covered = skin.step(distance, 0.16, 0.06) * (region != skin.CLOTH) * ~face_mask(head.vertices, landmarks)
     covered *= head.vertices[:, 1] > landmarks[CHIN, 1]
     albedo = head.albedo * (1 - covered[:, None]) + wig.albedo[near] * covered[:, None]

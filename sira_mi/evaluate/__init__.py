@@ -1,0 +1,1 @@
+"""Evidence: how good the priors are, measured on heads that they have not seen."""
