@@ -13,12 +13,14 @@ from conftest import SMALL, small_avatar
 from sira_mi.conventions import HELD_OUT_VIEWS, LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.evaluate import appearance_prior as ap
+from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope
-from sira_mi.models import af_sm
+from sira_mi.models import af_sm, skin_tone
 from sira_mi.models.avatar import LANDMARKS
 from sira_mi.models.prior import assemble_prior
 from sira_mi.models.scenes import TrainingScene
+from sira_mi.sg.scene_shading import shade_scenes
 
 SETTINGS = af_sm.AppearanceTraining(frozen_points=400)
 
@@ -112,8 +114,15 @@ def shaded(lit_points, per_scene: bool):
             parts.append(both[0] + 2.0 * both[1])
         radiance = dr.concat(parts, axis=1)
     else:
-        irradiance, glossy = af_sm.shade_scenes(normals, views, specular, 0.5, lobes, 3)
-        radiance = irradiance + 2.0 * glossy
+        irradiance, glossy = shade_scenes(
+            from_columns(normals, mi.Vector3f),
+            from_columns(-views, mi.Vector3f),
+            from_columns(specular, mi.Float),
+            0.5,
+            lobes,
+            3,
+        )
+        radiance = to_columns(irradiance) + 2.0 * to_columns(glossy)
     dr.backward(dr.sum(radiance * mi.TensorXf(random(3, 21, seed=8)), axis=None))
     return radiance.numpy(), dr.grad(specular).numpy(), dr.grad(lobes).numpy()
 
@@ -135,7 +144,10 @@ def skin_loss(albedo: np.ndarray, weight: np.ndarray, radiance: float = SETTINGS
     columns = np.repeat(albedo.T[:, :, None], weight.shape[1], axis=2).reshape(3, -1).astype(np.float32)
     weight = mi.TensorXf(weight.reshape(1, -1).astype(np.float32))
     level = np.full(len(albedo), radiance)
-    return float(af_sm.skin_tone_loss(mi.TensorXf(columns), weight, level, SETTINGS).numpy().item())
+    loss = skin_tone.skin_tone_loss(
+        mi.TensorXf(columns), weight, level, SETTINGS.skin_radiance, SETTINGS.skin_deviations
+    )
+    return float(loss.numpy().item())
 
 
 def linear(srgb: list[int]) -> np.ndarray:
@@ -146,7 +158,7 @@ def test_skin_tone_loss_expects_measured_skin():
     """0 at the mean of measured skin, large for blue and for grey skin; scenes without landmarks do not count. The
     skin patches of the ColorChecker lie on the axis: they are expected when the photo is as much brighter or darker."""
     even = np.full((1, 4), 0.25)
-    mean = np.exp(af_sm.SKIN_TONE_MEAN)
+    mean = np.exp(skin_tone.SKIN_TONE_MEAN)
     assert skin_loss(mean[None], even) < 1e-6
     assert skin_loss(mean[None], even, radiance=float("nan")) < 1e-6
     for patch in ([194, 150, 130], [115, 82, 68]):
@@ -167,9 +179,9 @@ def test_skin_radiance_is_that_of_the_observations_near_the_landmarks(scene):
     luminance = (scene.sample_color @ LUMINANCE)[near[scene.sample_point]]
     assert len(luminance) > 1
     expected = np.exp(np.log(luminance).mean())
-    assert af_sm.skin_radiance(scene, landmarks) == pytest.approx(expected, rel=1e-5)
-    assert np.isnan(af_sm.skin_radiance(scene, landmarks[:0]))
-    assert np.isnan(af_sm.skin_radiance(scene, landmarks + 50))
+    assert skin_tone.skin_radiance(scene, landmarks) == pytest.approx(expected, rel=1e-5)
+    assert np.isnan(skin_tone.skin_radiance(scene, landmarks[:0]))
+    assert np.isnan(skin_tone.skin_radiance(scene, landmarks + 50))
 
 
 # A head made by the model

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
@@ -19,27 +17,12 @@ from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, in_three, s
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture
 from sira_mi.models.scenes import TrainingScene
-from sira_mi.sg.lobes import unpack_raw
-from sira_mi.sg.shading import diffuse_irradiance, shade
-from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
+from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_radiance, skin_tone_loss
+from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.sg.shading import shade
 
 NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
 LATENTS = ("z_a", "z_s", "z_l")
-
-# Landmarks on bare facial skin: upper cheeks, bridge of the nose, forehead between the brows.
-SKIN_LANDMARKS = (50, 280, 101, 330, 117, 346, 118, 347, 6, 197, 9, 151)
-# Measured facial skin in log linear RGB. The patches "light skin" and "dark skin" of the ColorChecker, made after
-# measured skin (McCamy et al. 1976), sRGB (194, 150, 130) and (115, 82, 68), give its mean and the axis of skin tone;
-# across that axis skin varies as within one population (Yun et al. 2010, a* ± 2.65 and b* ± 2.39).
-SKIN_TONE_MEAN = np.array([-1.190, -1.830, -2.175])
-SKIN_TONE_AXIS = np.array([0.524, 0.587, 0.617])
-_SKIN_LUMINANCE = np.array(LUMINANCE) * np.exp(SKIN_TONE_MEAN)
-# Change of log luminance along the axis.
-_SKIN_TONE_SLOPE = float(_SKIN_LUMINANCE @ SKIN_TONE_AXIS / _SKIN_LUMINANCE.sum())
-# Observations within this distance of a landmark tell how bright the skin is in the photos, scene units.
-_SKIN_RADIUS = 0.06
-# Deviation from measured skin from which on the loss grows linearly, standard deviations.
-_SKIN_OUTLIER = 2.0
 
 
 @dataclass(frozen=True)
@@ -127,15 +110,6 @@ def freeze_scene(
     )
 
 
-def skin_radiance(scene: TrainingScene, landmarks: np.ndarray) -> float:
-    """Geometric mean of the luminance of the observations near `landmarks` [L, 3]; NaN when there are none."""
-    if not len(landmarks):
-        return float("nan")
-    near = cKDTree(landmarks).query(scene.points, distance_upper_bound=_SKIN_RADIUS)[0] < _SKIN_RADIUS
-    luminance = scene.sample_color[near[scene.sample_point]] @ np.array(LUMINANCE)
-    return float(np.exp(np.mean(np.log(np.maximum(luminance, 1e-3))))) if len(luminance) else float("nan")
-
-
 def initial_appearance_model(architecture: AvatarArchitecture, scenes: int, seed: int) -> dict:
     """Starting values of the three decoders and the latents [dim, scenes]."""
     rng = np.random.default_rng([seed, 1])
@@ -206,103 +180,6 @@ def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes):
     return albedo * to_columns(irradiance) * (1 / np.pi), to_columns(specular_radiance) * k_s
 
 
-def _integrate_lobe(point, axis, sharpness, amplitude):
-    """Irradiance, white and grazing specular radiance `[..., 3]` of one light lobe."""
-    white, grazing = specular_integrals(point, axis, sharpness)
-    return diffuse_irradiance(point.normal, axis, sharpness, amplitude), amplitude * white, amplitude * grazing
-
-
-class _SumOfLights(dr.CustomOp):
-    """Irradiance, white and grazing specular radiance of S·n points, n consecutive ones under each of S lights.
-
-    `packed` is the flat array of lights [S, N_l, 7]; only it is differentiated, the points are constants. Each lane
-    of the adjoint writes its point's share of every lobe's gradient to a place of its own, and the shares are then
-    added by a block reduction: sums of one fixed order, the same bits on every run."""
-
-    def eval(self, packed, lights, *point):
-        width = dr.width(*point)
-        self.point = SpecularLobes(*(value + dr.zeros(type(value), width) for value in point))
-        self.packed, self.count, self.points = packed, len(packed) // (7 * lights), width // lights
-        dr.eval(self.point, packed)
-        first = dr.arange(mi.UInt32, width) // self.points * self.count
-
-        def body(index, *sums):
-            axis, sharpness, amplitude = unpack_raw(packed, first + index)
-            parts = _integrate_lobe(self.point, dr.normalize(axis), sharpness, amplitude)
-            return index + 1, *(total + part for total, part in zip(sums, parts, strict=True))
-
-        return dr.while_loop(
-            state=(mi.UInt32(0), mi.Color3f(0.0), mi.Color3f(0.0), mi.Color3f(0.0)),
-            cond=lambda index, *_: index < self.count,
-            body=body,
-            labels=("index", "irradiance", "white", "grazing"),
-        )[1:]
-
-    def backward(self):
-        with dr.resume_grad():
-            self.set_grad_in("packed", self._gradient(self.grad_out()))
-
-    def _gradient(self, gradient):
-        width = dr.width(*self.point)
-        gradient = tuple(value + dr.zeros(type(value), width) for value in gradient)
-        dr.eval(gradient)
-        lane = dr.arange(mi.UInt32, width)
-        light = lane // self.points
-        place = light * (self.count * self.points) + lane % self.points
-        shares = [dr.empty(mi.Float, width * self.count) for _ in range(7)]
-
-        def body(index):
-            inputs = unpack_raw(self.packed, light * self.count + index)
-            dr.enable_grad(inputs)
-            parts = _integrate_lobe(self.point, dr.normalize(inputs[0]), *inputs[1:])
-            loss = sum(dr.dot(part, weight) for part, weight in zip(parts, gradient, strict=True))
-            dr.backward(loss, dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-            axis, sharpness, amplitude = (dr.grad(value) for value in inputs)
-            for share, value in zip(shares, (*axis, sharpness, *amplitude), strict=True):
-                dr.scatter(share, value, place + index * self.points)
-            return (index + 1,)
-
-        dr.while_loop((mi.UInt32(0),), lambda index: index < self.count, body, labels=("index",))
-        return dr.ravel(mi.ArrayXf([dr.block_sum(share, self.points) for share in shares]))
-
-    def name(self):
-        return "sum_of_lights"
-
-
-def shade_scenes(normals, views, specular, roughness: float, lobes, scenes: int):
-    """Irradiance and specular radiance [3, S·n] of the points of `scenes` S scenes, each scene's points consecutive and
-    under its own light `lobes` [N_l, 7, S]: `sg.shading.shade` for all scenes in one launch. Unit `normals` and
-    `views` [3, S·n], from the camera to the point, are constants; differentiable in `specular` [1, S·n] and `lobes`."""
-    point = specular_lobes(from_columns(normals, mi.Vector3f), from_columns(-views, mi.Vector3f), mi.Float(roughness))
-    packed = dr.moveaxis(lobes, 2, 0).array
-    irradiance, white, grazing = dr.custom(_SumOfLights, packed, scenes, *point)
-    return to_columns(irradiance), to_columns(dr.lerp(grazing, white, from_columns(specular, mi.Float)))
-
-
-def skin_tone_loss(albedo, weight, radiance: np.ndarray, settings: AppearanceTraining):
-    """Mean over scenes of the squared deviation x² of the log of a scene's mean skin albedo from measured skin, in
-    standard deviations along and across the axis of skin tone; far out it grows with |x| only (pseudo-Huber), so that
-    painted faces are possible. `albedo` [3, S·L], `weight` [1, S·L] and `radiance` [S] as in `FrozenScene`; scenes of
-    weight 0 do not count.
-
-    Photos are taken to be exposed for the light: along the axis, skin that is brighter in its photos than
-    `settings.skin_radiance` is expected to be lighter by as much."""
-    scenes = len(radiance)
-    mean = dr.sum(dr.reshape(albedo * in_three(weight), (3, scenes, -1)), axis=2)
-    known = dr.sum(dr.reshape(weight, (1, scenes, -1)), axis=2)
-    axis = SKIN_TONE_AXIS / np.linalg.norm(SKIN_TONE_AXIS)
-    shift = np.nan_to_num(np.log(radiance / settings.skin_radiance)) / _SKIN_TONE_SLOPE
-    centre = mi.TensorXf((SKIN_TONE_MEAN[:, None] + axis[:, None] * shift).astype(np.float32))
-    deviation = dr.log(mean + in_three(1.0 - known) * dr.exp(centre)) - centre
-    along = mi.TensorXf(axis[None, :].astype(np.float32)) @ deviation
-    along = dr.sum(along * along, axis=0)
-    across = dr.sum(deviation * deviation, axis=0) - along
-    wide, narrow = settings.skin_deviations
-    square = along * (1 / wide**2) + across * (1 / narrow**2)
-    bend = 2.0 * _SKIN_OUTLIER**2
-    return losses.mean(bend * (dr.sqrt(1.0 + square * (1 / _SKIN_OUTLIER**2)) - 1.0))
-
-
 def appearance_losses(architecture, settings: AppearanceTraining, parameters: dict, batch: AppearanceBatch) -> dict:
     """Every term of eq. 10 and the anchors, unweighted, by the names of `AppearanceTraining`."""
     z_a, z_s, z_l = (parameters[name] @ batch.scenes for name in LATENTS)
@@ -315,9 +192,14 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     lobes = illumination(layers(networks["illumination"], parameters["illumination"]), z_l)
 
     irradiance, specular_radiance = shade_scenes(
-        batch.normals, batch.views, specular, settings.roughness, lobes, batch.count
+        from_columns(batch.normals, mi.Vector3f),
+        from_columns(-batch.views, mi.Vector3f),
+        from_columns(specular, mi.Float),
+        settings.roughness,
+        lobes,
+        batch.count,
     )
-    radiance = albedo * irradiance * (1 / np.pi) + specular_radiance
+    radiance = albedo * to_columns(irradiance) * (1 / np.pi) + to_columns(specular_radiance)
     skin = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.skin_x_ref, batch.skin_gamma)
     difference = albedo - moved
     anchor = dr.log(specular * (1 / SKIN_SPECULAR))
@@ -329,7 +211,9 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
         "smoothness": losses.mean(dr.abs(difference)),
         "specular_anchor": losses.mean(anchor * anchor),
         "white_light": losses.mean(grey * grey),
-        "skin_tone": skin_tone_loss(skin, batch.skin_weight, batch.skin_radiance, settings),
+        "skin_tone": skin_tone_loss(
+            skin, batch.skin_weight, batch.skin_radiance, settings.skin_radiance, settings.skin_deviations
+        ),
     }
 
 

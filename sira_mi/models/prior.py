@@ -53,8 +53,8 @@ def assemble_prior(
     seed: int,
 ) -> Avatar:
     """The mean head of both trained models. All latents become standard normal: the zero latent is the mean of the
-    trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes
-    that have them."""
+    trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement
+    starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes that have them."""
     owners = {
         "z_sdf": "deformation",
         "z_r": "rendering",
