@@ -42,9 +42,9 @@ SIZES = {
 class Protocol:
     """How every short training is measured."""
 
-    scans: int = 24  # of the test split, evenly spread
+    scans: int = 16  # of the test split, evenly spread
     points: int = 3000  # of each scan
-    heads: int = 12  # random ones at 1σ
+    heads: int = 8  # random ones at 1σ
     cost_points: int = 16384  # points of a timed evaluation
     fit: ShapeFit = field(default_factory=ShapeFit)
     color_steps: int = 200  # of the fit of z_r
