@@ -112,9 +112,10 @@ def train_shape(
     without: str | None = None,
     sizes: dict[str, int] | None = None,
     picture_steps: int = 1000,
+    scenes: list | None = None,
 ) -> dict[str, np.ndarray]:
     """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
-    `sizes` the sizes that differ from AvatarArchitecture's."""
+    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
     from sira_mi.models import sa_sm
     from sira_mi.models.optimisation import adam
     from sira_mi.models.pictures import shape_picture
@@ -126,7 +127,7 @@ def train_shape(
     settings = without_term(sa_sm.ShapeTraining(), SHAPE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
-    scenes = load_training_scenes(collection)
+    scenes = scenes or load_training_scenes(collection)
     initial = sa_sm.initial_shape_model(architecture, settings, len(scenes), seed)
     optimizer = adam(initial, sa_sm.rates(settings, 0))
 
@@ -161,9 +162,11 @@ def train_appearance(
     without: str | None = None,
     sizes: dict[str, int] | None = None,
     picture_steps: int = 1000,
+    scenes: list | None = None,
 ) -> None:
     """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`, whose architecture it takes over; writes
-    `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only."""
+    `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only; `scenes` are the
+    collection's if they are loaded already."""
     from sira_mi.models import af_sm
     from sira_mi.models.avatar import save_avatar
     from sira_mi.models.optimisation import adam
@@ -186,7 +189,7 @@ def train_appearance(
     settings = without_term(af_sm.AppearanceTraining(), APPEARANCE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
-    scenes = load_training_scenes(collection)
+    scenes = scenes or load_training_scenes(collection)
     if any(shape[name].shape != (architecture.networks[name].parameters,) for name in NETWORKS):
         raise InputError(f"{checkpoint} does not fit its architecture; train it again")
     if any(shape[name].shape != (architecture.latents[name], len(scenes)) for name in LATENTS):

@@ -14,7 +14,8 @@ from test_training import SIZES, ball_collection
 from sira_mi import train
 from sira_mi.errors import InputError
 from sira_mi.evaluate import __main__ as command
-from sira_mi.evaluate import ablations, prior_page, shape_evidence, shape_prior
+from sira_mi.evaluate import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
+from sira_mi.evaluate.appearance_prior import LatentFit
 from sira_mi.evaluate.cache import cached, fingerprint, read
 from sira_mi.evaluate.shape_prior import Scan, ShapeFit
 from sira_mi.fields.appearance import rendered_radiance
@@ -65,7 +66,7 @@ def scan_of(model, w, w_r, seed: int) -> Scan:
 def own(model):
     """Scans of three heads of the model, and the latents that they were made with."""
     rng = np.random.default_rng(4)
-    w, w_r = 0.7 * rng.standard_normal((SMALL.sdf_latent, 3)), rng.standard_normal((SMALL.rendering_latent, 3))
+    w, w_r = 0.5 * rng.standard_normal((SMALL.sdf_latent, 3)), rng.standard_normal((SMALL.rendering_latent, 3))
     return [scan_of(model, w[:, k], w_r[:, k], k) for k in range(3)], w
 
 
@@ -151,7 +152,7 @@ def test_components_of_a_mesh(centres, parts):
 
 def test_a_fit_recovers_the_models_own_heads(model, own):
     scans, _ = own
-    w = shape_prior.fit_shape(model, scans, ShapeFit(steps=120))
+    w = shape_prior.fit_shape(model, scans, ShapeFit(steps=200))
     errors = {}
     for name, latents in (("fitted", w), ("mean", 0 * w)):
         fields = [model.field(model.latent("z_sdf", latents[:, k])) for k in range(3)]
@@ -257,6 +258,8 @@ def balls(tmp_path_factory):
 
 FIT = ShapeFit(steps=20, points=32)
 MEASURES = shape_evidence.Measures(points=300, heads=2, fit=FIT, color_steps=5)
+LATENT_FIT = LatentFit(steps=3, scenes=2, points=16)
+APPEARANCE_MEASURES = appearance_evidence.AppearanceMeasures(imaged=1, pictured=1, training_scenes=1, fit=LATENT_FIT)
 PROTOCOL = ablations.Protocol(scans=1, points=100, heads=1, cost_points=256, fit=FIT, color_steps=5)
 
 
@@ -265,6 +268,9 @@ def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_pa
     monkeypatch.setattr(shape_evidence, "Measures", lambda: MEASURES)
     monkeypatch.setattr(ablations, "Protocol", lambda: PROTOCOL)
     monkeypatch.setattr(ablations, "SHAPE_TERMS", ("eikonal",))
+    monkeypatch.setattr(appearance_evidence, "AppearanceMeasures", lambda: APPEARANCE_MEASURES)
+    monkeypatch.setattr(appearance_evidence, "LatentFit", lambda: LATENT_FIT)
+    monkeypatch.setattr(appearance_evidence, "APPEARANCE_TERMS", ("smoothness",))
     monkeypatch.setattr(ablations, "architectures", lambda: {"complete": SIZES, "small": {**SIZES, "features": 2}})
     for name, option in (("sizes", "--steps"), ("prior", "--ablation-steps")):
         arguments = [name, "--collection", str(collection), "--runs", str(runs), "--out", str(tmp_path), option, "2"]
@@ -272,9 +278,17 @@ def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_pa
         command.main()
     text = (tmp_path / "priors.md").read_text()
     assert "Not measured yet" not in text and "nan" not in text
-    for row in ("| ancestry | round | 2 |", "| age | old | 1 |", "| without eikonal |", "| all terms |", "3 balls"):
+    for row in (
+        "| ancestry | round | 2 |",
+        "| age | old | 1 |",
+        "| without eikonal |",
+        "| all terms |",
+        "3 balls",
+        "| without smoothness |",
+        "| specular albedo as strength, dB |",
+    ):
         assert row in text, row
-    for picture in ("prior_fits", "prior_samples_1", "prior_samples_2", "prior_directions"):
+    for picture in ("prior_fits", "prior_samples_1", "prior_samples_2", "prior_directions", "prior_appearance"):
         assert (tmp_path / "images" / f"{picture}.png").stat().st_size > 500 and f"images/{picture}.png" in text
 
     fits = json.loads((runs / "evidence" / "fits.json").read_text())["result"]

@@ -23,7 +23,7 @@ from sira_mi.collection.surface import head_topology
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError, run_command
 
-SETTINGS = AnnotationSettings(size=512, grid=2, search=True)
+SETTINGS = AnnotationSettings(size=512, grid=2, expected_cosine=-1, search=True)
 FEWEST_MARKS = 5
 
 

@@ -24,6 +24,7 @@ from sira_mi.collection.render import (
     Part,
     RenderSettings,
     build_scene,
+    camera_position,
     exposure,
     intrinsic_matrix,
     look_at,
@@ -32,7 +33,7 @@ from sira_mi.collection.render import (
 from sira_mi.collection.sheet import encode_srgb
 from sira_mi.collection.skin import EYE, SKIN
 from sira_mi.collection.subject import BrokenHead
-from sira_mi.collection.surface import eye_spheres, head_surface
+from sira_mi.collection.surface import eye_spheres, head_surface, vertex_normals
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.portrait.face import Face, find_faces, landmarks_of
 
@@ -61,6 +62,9 @@ class AnnotationSettings:
     field_of_view: float = 14.0  # degrees
     distance: float = 14.0  # scene units
     smallest_cosine: float = 0.25  # between surface normal and view, below which a mark is not used
+    # Between the mean head's surface normal at a landmark and view, below which the mark is not used: the network puts
+    # landmarks that are turned away on the outline. -1 uses all.
+    expected_cosine: float = 0.5
     presence: float = 0.5  # the network's confidence below which a view is not used
     search: bool = False  # find the face by the detector, not where the mean head has it
 
@@ -110,6 +114,14 @@ def mean_eyes() -> np.ndarray:
 def mean_head() -> tuple[np.ndarray, np.ndarray]:
     """Landmarks [468, 3] in scene units and validity [468] of the MakeHuman head of average age, sex and ancestry."""
     return mesh_landmarks(head_surface(_mean_control())[0])
+
+
+@cache
+def _mean_normals():
+    """Unit normals [468, 3] at the mean head's landmarks."""
+    head, triangles = head_surface(_mean_control())
+    normals = mesh_landmarks(vertex_normals(head, triangles))[0]
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 
 
 def align(source: np.ndarray, target: np.ndarray, scaled: bool) -> Similarity:
@@ -176,7 +188,10 @@ def mark_views(parts: list[Part], settings: AnnotationSettings) -> Marks:
     for image, intrinsic, pose in zip(shown, intrinsics, poses, strict=True):
         face = _face(image, intrinsic, pose, settings)
         if face is not None:
-            rows.append(_trace(scene, parts, face.landmarks, intrinsic, pose, settings.smallest_cosine))
+            points, *hit = _trace(scene, parts, face.landmarks, intrinsic, pose, settings.smallest_cosine)
+            if settings.expected_cosine > -1:
+                points[~_turned_to(pose, settings.expected_cosine)] = np.nan
+            rows.append((points, *hit))
     if not rows:
         return Marks(np.zeros((0, COUNT, 3)), *(np.zeros((0, COUNT), int),) * 2, np.zeros((0, COUNT, 3)))
     return Marks(*(np.stack(column) for column in zip(*rows, strict=True)))
@@ -228,6 +243,12 @@ def _face(image, intrinsic, pose, settings):
     for _ in range(2):
         face = landmarks_of(image, face)
     return face if face.presence >= settings.presence else None
+
+
+def _turned_to(pose, cosine):
+    """Whether the mean head's landmarks [468] are turned to a camera."""
+    way = camera_position(pose) - mean_head()[0]
+    return (way * _mean_normals()).sum(1) > cosine * np.linalg.norm(way, axis=1)
 
 
 def _trace(scene, parts, pixels, intrinsic, pose, smallest_cosine):

@@ -9,6 +9,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import drjit as dr
@@ -21,6 +22,7 @@ from sira_mi.evaluate.shape_prior import Scan, ShapeFit
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture
+from sira_mi.models.scenes import TrainingScene, load_training_scenes
 from sira_mi.models.shape_model import ShapeModel
 from sira_mi.models.training import trained_parameters
 from sira_mi.train import SHAPE_TERMS, read_architecture, train_shape
@@ -111,7 +113,7 @@ def _trained(collection: Path, folder: Path, name: str, steps: int, protocol: Pr
     """Trains into `folder/name_steps`, then measures, each unless that is done already; `options` are of
     `train_shape`."""
     run = folder / f"{name}_{steps}"
-    train_shape(collection, run, steps=steps, picture_steps=steps, **options)
+    train_shape(collection, run, steps=steps, picture_steps=steps, scenes=training_scenes(collection), **options)
     checkpoint = run / "shape.checkpoint"
 
     def result() -> dict:
@@ -121,6 +123,12 @@ def _trained(collection: Path, folder: Path, name: str, steps: int, protocol: Pr
 
     key = fingerprint(_VERSION, checkpoint, collection / "manifest.json", json.dumps(asdict(protocol)))
     return cached(folder / f"{name}_{steps}.json", key, result)
+
+
+@lru_cache(maxsize=1)
+def training_scenes(collection: Path) -> list[TrainingScene]:
+    """The training scenes of a collection, kept from one short training to the next."""
+    return load_training_scenes(collection)
 
 
 def mean_nose(collection: Path) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sira_mi.errors import InputError
 from sira_mi.evaluate import appearance_prior as measures_of
-from sira_mi.evaluate.ablations import COMPLETE, read_model, seconds
+from sira_mi.evaluate.ablations import COMPLETE, read_model, seconds, training_scenes
 from sira_mi.evaluate.appearance_prior import HeldOut, LatentFit
 from sira_mi.evaluate.cache import cached, fingerprint, read
 from sira_mi.evaluate.shape_prior import manifest_entries
@@ -116,7 +116,8 @@ def _ablation(collection: Path, runs: Path, without: str | None, steps: int, sca
     run.mkdir(parents=True, exist_ok=True)
     if not (run / "shape.checkpoint").exists():
         shutil.copyfile(runs / "shape.checkpoint", run / "shape.checkpoint")
-    train_appearance(collection, run, steps=steps, without=without, picture_steps=steps)
+    scenes = training_scenes(collection)
+    train_appearance(collection, run, steps=steps, without=without, picture_steps=steps, scenes=scenes)
 
     def result() -> dict:
         held_out, scenes, z_sdf = _test_scans(collection, runs / "evidence", scans)

@@ -146,11 +146,11 @@ def read_avatar(path: Path) -> tuple[dict[str, Surface], np.ndarray]:
     missing = [name for name in (BODY, *EYES, *GLANDS) if name not in names]
     if missing:
         raise BrokenHead(f"it has no part {missing[0]}")
-    surfaces = {}
-    for name in (BODY, *EYES, *GLANDS, WIG):
-        if name in names:
-            image = path.with_name(f"{path.stem}_wig.jpg" if name == WIG else f"{path.stem}.jpg")
-            surfaces[name] = _surface(v, f[part == names.index(name)], uv, _read_texture(image))
+    painted = _read_texture(path.with_name(f"{path.stem}.jpg"))
+    surfaces = {name: _surface(v, f[part == names.index(name)], uv, painted) for name in (BODY, *EYES, *GLANDS)}
+    if WIG in names:
+        strands = _read_texture(path.with_name(f"{path.stem}_wig.jpg"))
+        surfaces[WIG] = _surface(v, f[part == names.index(WIG)], uv, strands)
     return surfaces, eyes.astype(float)
 
 
