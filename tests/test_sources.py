@@ -21,10 +21,11 @@ from sira_mi.collection.landmarks import mesh_landmarks
 from sira_mi.collection.person import make_person
 from sira_mi.collection.sheet import encode_srgb
 from sira_mi.collection.sources import meshes, valid
-from sira_mi.collection.sources.meshes import MeshSource, Surface, close_borders, place_index, refine
+from sira_mi.collection.sources.meshes import MeshSource
 from sira_mi.collection.sources.valid import ValidSource, group_of
 from sira_mi.collection.subject import BrokenHead
 from sira_mi.collection.surface import BODY_FLOOR
+from sira_mi.collection.textured_surface import Surface, close_borders, place_index, refine
 from sira_mi.errors import InputError
 
 SEED = 5000

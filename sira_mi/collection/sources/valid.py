@@ -17,27 +17,22 @@ from sira_mi.collection import hair as hairs
 from sira_mi.collection import skin
 from sira_mi.collection.annotation import Similarity, mean_eyes, place
 from sira_mi.collection.person import HAIR_SPECULAR, STRAND_RELIEF
-from sira_mi.collection.render import Part
-from sira_mi.collection.sources.meshes import (
+from sira_mi.collection.regions import (
     CHIN,
-    LARGEST_TEXTURE,
-    MOST_TRIANGLES,
-    Surface,
     albedo_scale,
     classify,
-    close_borders,
     complete,
-    decode_texture,
     face_mask,
     head_edges,
     painted_part,
     plain_part,
-    refine,
-    sample_texture,
     skin_specular,
 )
+from sira_mi.collection.render import Part
+from sira_mi.collection.sources.meshes import LARGEST_TEXTURE, MOST_TRIANGLES
 from sira_mi.collection.subject import BrokenHead, Subject
 from sira_mi.collection.surface import vertex_normals
+from sira_mi.collection.textured_surface import Surface, close_borders, decode_texture, refine, sample_texture
 from sira_mi.errors import InputError
 
 UNITS_PER_METRE = 10.0
