@@ -345,10 +345,13 @@ def test_symmetrise_pairs_noisy_mirror_points():
 class FakeSource:
     """Three identities, the last of them broken."""
 
-    name, licence = "fake", "none"
+    name, licence, first = "fake", "none", 0
 
     def count(self):
         return 3
+
+    def title(self, number):
+        return f"{self.name}/{self.first + number}"
 
     def subject(self, number, seed):
         if number == 2:
@@ -357,12 +360,13 @@ class FakeSource:
 
 
 def test_build_resumes_lists_errors_and_splits(variant, tmp_path, monkeypatch):
-    settings = building.BuildSettings(sources=(FakeSource(),), seed=7, hdri=None, workers=1)
+    source = FakeSource()
+    settings = building.BuildSettings(sources=(source,), seed=7, hdri=None, workers=1)
     made = []
 
     def fake(subject, seed, maps, scene_settings):
         made.append(subject)
-        info = {"name": f"fake/{subject}", "group": {"sex": "unknown"}, "licence": "none", "seed": seed}
+        info = {"name": source.title(subject), "group": {"sex": "unknown"}, "licence": "none", "seed": seed}
         return {name: np.zeros(1) for name in scene.LAYOUT} | {"info": np.array(json.dumps(info))}
 
     monkeypatch.setattr(building, "make_scene", fake)
@@ -375,6 +379,9 @@ def test_build_resumes_lists_errors_and_splits(variant, tmp_path, monkeypatch):
     assert [entry.get("group") for entry in again["scenes"]] == [entry.get("group") for entry in manifest["scenes"]]
     assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["sources"] == {"fake": 3}
     assert not list(tmp_path.glob(".*"))
+    source.first = 1
+    building.build(tmp_path, settings)
+    assert made == [0, 1, 1, 0, 1], "scenes of other identities under the same numbers are made again"
 
 
 def test_the_split_of_an_identity_does_not_depend_on_the_count():

@@ -57,12 +57,13 @@ def finished_info(path: Path) -> dict | None:
 
 
 def build_one(task: tuple[Source, int], out: Path, settings: BuildSettings, scene_settings: SceneSettings) -> dict:
-    """Makes one scene unless it is complete; returns its manifest entry, with `error` when it failed."""
+    """Makes one scene unless a complete one of the same identity and seed is there; returns its manifest entry, with
+    `error` when it failed."""
     source, number = task
     path, seed = out / scene_name(source, number), scene_seed(settings, source, number)
     entry = {"file": path.name, "source": source.name, "number": number, "seed": seed, "split": split_of(number)}
     info = finished_info(path)
-    if info is not None and info.get("seed") == seed:
+    if info is not None and (info.get("name"), info.get("seed")) == (source.title(number), seed):
         return entry | _of_info(info)
     if mi.variant() != VARIANT:
         mi.set_variant(VARIANT)

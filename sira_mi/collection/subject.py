@@ -34,5 +34,8 @@ class Source(Protocol):
     def count(self) -> int:
         """Number of identities."""
 
+    def title(self, number: int) -> str:
+        """Name of identity `number`, SOURCE/…, that its subject has."""
+
     def subject(self, number: int, seed: int) -> Subject:
         """Identity `number`, its look drawn from `seed`. Raises `BrokenHead` when it cannot be used."""

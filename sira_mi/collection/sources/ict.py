@@ -23,6 +23,9 @@ class IctSource:
     def count(self) -> int:
         return self.heads
 
+    def title(self, number: int) -> str:
+        return f"{self.name}/{number:04d}"
+
     def subject(self, number: int, seed: int) -> Subject:
         random = np.random.default_rng([seed, 11])
         coefficients = sample_coefficients(random)
@@ -35,7 +38,7 @@ class IctSource:
         person = dress(ict_control(self.path, coefficients), traits, random, self.hair)
         landmarks, valid = mesh_landmarks(person.head)
         return Subject(
-            f"{self.name}/{number:04d}",
+            self.title(number),
             person.parts,
             landmarks,
             valid,

@@ -23,11 +23,14 @@ class MakeHumanSource:
     def count(self) -> int:
         return self.heads
 
+    def title(self, number: int) -> str:
+        return f"{self.name}/{number:04d}"
+
     def subject(self, number: int, seed: int) -> Subject:
         person = make_person(seed, self.hair)
         landmarks, valid = mesh_landmarks(person.head)
         return Subject(
-            f"{self.name}/{number:04d}",
+            self.title(number),
             person.parts,
             landmarks,
             valid,

@@ -62,6 +62,9 @@ class MeshSource:
             raise InputError(f"{self.folder}: no meshes found; expected files ending in {', '.join(ENDINGS)}")
         return number
 
+    def title(self, number: int) -> str:
+        return f"{self.name}/{self.files()[number].name}"
+
     def subject(self, number: int, seed: int) -> Subject:
         path = self.files()[number]
         surfaces = read_surfaces(path)
@@ -94,7 +97,7 @@ class MeshSource:
             "landmark_spread_mm": float(np.nanmedian(spread)),
         }
         group = {"ancestry": "unknown", "sex": "unknown", "age": "unknown"}
-        return Subject(f"{self.name}/{path.name}", parts, landmarks, valid, group, description, self.licence)
+        return Subject(self.title(number), parts, landmarks, valid, group, description, self.licence)
 
 
 def grounded(surface: Surface, chin: float) -> Surface:

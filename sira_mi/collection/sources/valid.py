@@ -65,6 +65,9 @@ class ValidSource:
             raise InputError(f"{self.folder}: no VALID avatars found; expected NAME.npz with NAME.jpg")
         return number
 
+    def title(self, number: int) -> str:
+        return f"{self.name}/{self.files()[number].stem}"
+
     def subject(self, number: int, seed: int) -> Subject:
         path = self.files()[number]
         random = np.random.default_rng([seed, 31])
@@ -101,8 +104,9 @@ class ValidSource:
             "wig": wig is not None,
             "landmark_spread_mm": float(np.nanmedian(spread)),
         }
-        name = f"{self.name}/{path.stem}"
-        return Subject(name, [head, *others], landmarks, valid, group_of(path.stem), description, self.licence)
+        return Subject(
+            self.title(number), [head, *others], landmarks, valid, group_of(path.stem), description, self.licence
+        )
 
 
 def group_of(stem: str) -> dict[str, str]:
