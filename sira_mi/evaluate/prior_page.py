@@ -268,7 +268,7 @@ def sizes_section(evidence: Path) -> str:
         [
             *(str(r["sizes"][name]) for name in names),
             *(number(r["face"]), number(r["head"]), number(r["angle"], 1)),
-            *(str(r["parameters"]), number(r["forward"]), number(r["backward"]), number(r["seconds"], 0)),
+            *(str(r["parameters"]), number(r["forward"]), number(r["backward"])),
         ]
         for r in results
     ]
@@ -277,7 +277,7 @@ def sizes_section(evidence: Path) -> str:
 ablations are; the first row is the shipped architecture. Costs are microseconds a point: the signed distance alone,
 and distance and gradient with the derivative of a loss on both by all parameters.
 
-{table([*head, "training, s"], lines)}"""
+{table(head, lines)}"""
 
 
 def training_section(evidence: Path) -> str:
