@@ -275,7 +275,8 @@ def sizes_section(evidence: Path) -> str:
     head = [*names, "face, mm", "head, mm", "normals, °", "parameters", "distance, µs", "with derivatives, µs"]
     return f"""Each trained for {results[0]["steps"]} steps and measured on {results[0]["scans"]} test scans as the
 ablations are; the first row is the shipped architecture. Costs are microseconds a point: the signed distance alone,
-and distance and gradient with the derivative of a loss on both by all parameters.
+and distance and gradient with the derivative of a loss on both by all parameters. On a shared machine they vary by a
+third from run to run.
 
 {table(head, lines)}"""
 
