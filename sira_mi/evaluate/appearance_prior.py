@@ -18,27 +18,31 @@ from zipfile import BadZipFile
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from skimage.metrics import structural_similarity
 
-from sira_mi.conventions import HELD_OUT_VIEWS, LUMINANCE, MILLIMETRES_PER_UNIT
+from sira_mi.conventions import HELD_OUT_VIEWS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.evaluate.measures import (
+    F0_OF_STRENGTH,
+    FACE_RADIUS,
+    NOSE_TIP,
+    channel_scaled,
+    leakage,
+    luminance,
+    psnr,
+    ssim_inside,
+)
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, surface
+from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.models import af_sm
-from sira_mi.models.avatar import Avatar, save_avatar
+from sira_mi.models.avatar import Avatar, save_avatar, signed_distance_field
 from sira_mi.models.optimisation import adam, parameter_values
 from sira_mi.models.prior import whitening
 from sira_mi.models.scenes import TrainingScene
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.sg.shading import shade
 
-# Reflectance at normal incidence of specular strength 1.
-F0_OF_STRENGTH = 0.08
-# The face: within this distance of the nose tip, mm; and the nose tip's landmark.
-FACE_RADIUS, NOSE_TIP = 95.0, 4
-_PEAK_NOISE = 1e-12
 _ARRAYS = ("points", "albedo", "specular", "visible", "colors", "K", "world_to_camera", "images", "masks", "landmarks")
 
 
@@ -171,12 +175,8 @@ class Factors:
 
 def surface_inputs(avatar: Avatar, z_sdf: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """x_ref [3, N], γ [N_γ, N] and unit normals [3, N] of the field with latent `z_sdf` [dim] at points [N, 3]."""
-    networks = avatar.architecture.networks
-    field = SdfField(
-        layers(networks["deformation"], mi.Float(avatar.tensors["deformation"]), mi.TensorXf(z_sdf[:, None])),
-        layers(networks["reference"], mi.Float(avatar.tensors["reference"])),
-        avatar.architecture.sdf_octaves,
-    )
+    decoders = mi.Float(avatar.tensors["deformation"]), mi.Float(avatar.tensors["reference"])
+    field = signed_distance_field(avatar.architecture, *decoders, mi.TensorXf(z_sdf[:, None]))
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x: surface(field, x), points.T)
     return [x_ref, gamma, gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)]
 
@@ -213,18 +213,6 @@ def factors(avatar: Avatar, latents: dict[str, np.ndarray], inputs: Sequence[np.
 # Measures
 
 
-def psnr(values: np.ndarray, truth: np.ndarray) -> float:
-    """PSNR in dB with peak 1 of arrays of one shape; NaN when they are empty."""
-    if not truth.size:
-        return float("nan")
-    return float(-10 * np.log10(max(np.mean((np.asarray(values, np.float64) - truth) ** 2), _PEAK_NOISE)))
-
-
-def channel_scaled(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """`values` [N, C] times the factor of each channel that brings them nearest to `truth` in least squares."""
-    return values * ((values * truth).sum(axis=0) / np.maximum((values * values).sum(axis=0), _PEAK_NOISE))
-
-
 def albedo_scores(values: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """PSNR of diffuse albedos [N, 3]: linear, sRGB-coded, and linear after one factor a channel."""
     return {
@@ -240,32 +228,6 @@ def specular_scores(f0: np.ndarray, strength: np.ndarray) -> dict[str, float]:
         "psnr": psnr(f0 / F0_OF_STRENGTH, strength),
         "psnr_f0": psnr(f0, strength * F0_OF_STRENGTH),
     }
-
-
-def ssim_inside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Mean structural similarity over the pixels of `mask` [H, W] of two images [H, W] or [H, W, 3] of values in
-    [0, 1]; both are black outside. NaN for an empty mask."""
-    if not mask.any():
-        return float("nan")
-    inside = mask if image.ndim == 2 else mask[..., None]
-    axis = None if image.ndim == 2 else 2
-    first, second = (np.where(inside, a, 0).astype(np.float64) for a in (image, truth))
-    similarity = structural_similarity(first, second, data_range=1.0, channel_axis=axis, full=True)[1]
-    return float(similarity[mask].mean())
-
-
-def leakage(albedo: np.ndarray, truth: np.ndarray, irradiance: np.ndarray) -> float:
-    """Correlation over points of the error of log albedo luminance with the log luminance of the irradiance, all
-    [N, 3]: positive where shading has gone into the albedo, 0 where none has."""
-    error = np.log(_luminance(albedo)) - np.log(_luminance(truth))
-    light = np.log(_luminance(irradiance))
-    if min(error.std(), light.std()) < 1e-9:
-        return 0.0
-    return float(np.corrcoef(error, light)[0, 1])
-
-
-def _luminance(values: np.ndarray) -> np.ndarray:
-    return np.maximum(values @ np.array(LUMINANCE), 1e-4)
 
 
 @dataclass(frozen=True)
@@ -323,7 +285,7 @@ def point_scores(
                 scores[f"{part}{prefix}specular_{name}"] = value
         albedo, truth = fitted.albedo.T[chosen], scene.albedo[chosen]
         scores[f"{part}leakage"] = leakage(albedo, truth, fitted.irradiance.T[chosen])
-        scores[f"{part}albedo_bias"] = float(np.mean(np.log2(_luminance(albedo) / _luminance(truth))))
+        scores[f"{part}albedo_bias"] = float(np.mean(np.log2(luminance(albedo) / luminance(truth))))
     return scores
 
 

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.evaluate.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statistics
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, signed_distance, surface
@@ -30,9 +31,6 @@ from sira_mi.models.pictures import blank_tile, extracted_surface, head_tile
 from sira_mi.models.scenes import TrainingScene, load_scene
 from sira_mi.models.shape_model import ShapeModel
 
-NOSE_TIP = 4  # index of the landmark
-FACE_RADIUS = 95.0  # mm around the nose tip
-SHOULDERS = -1.3  # y above which a point belongs to the head, scene units
 DISC_RADIUS = 3.0  # mm: a scan is a disc of this radius at every point, across its normal
 VOXEL = 0.05  # of extracted meshes, scene units
 GRADIENT_RANGE = (0.9, 1.1)
@@ -230,17 +228,6 @@ def regions_of(points: np.ndarray, hair: np.ndarray, nose: np.ndarray) -> dict[s
     head = points[:, 1] > SHOULDERS
     face = head & (np.linalg.norm(points - nose, axis=1) * MILLIMETRES_PER_UNIT < FACE_RADIUS)
     return dict(zip(REGIONS, (face, face & ~hair, head & ~hair, head), strict=True))
-
-
-def statistics(values: np.ndarray) -> dict[str, float]:
-    """Mean, median and 90th percentile; NaN of nothing."""
-    if not len(values):
-        return dict.fromkeys(("mean", "median", "p90"), float("nan"))
-    return {
-        "mean": float(values.mean()),
-        "median": float(np.median(values)),
-        "p90": float(np.percentile(values, 90)),
-    }
 
 
 def scan_errors(field: SdfField, scan: Scan, count: int, seed: int = 0) -> dict[str, dict]:

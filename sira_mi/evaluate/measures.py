@@ -1,0 +1,70 @@
+"""Measures of numbers and images against the truth, free of any model: statistics, PSNR, SSIM, scaling, leakage; and
+what all evaluations call the face, the head and specular strength."""
+
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from sira_mi.conventions import LUMINANCE
+
+NOSE_TIP = 4  # index of the landmark
+FACE_RADIUS = 95.0  # mm around the nose tip
+SHOULDERS = -1.3  # y above which a point belongs to the head, scene units
+F0_OF_STRENGTH = 0.08  # reflectance at normal incidence of specular strength 1
+_PEAK_NOISE = 1e-12
+
+
+def statistics(values: np.ndarray) -> dict[str, float]:
+    """Mean, median and 90th percentile; NaN of nothing."""
+    if not len(values):
+        return dict.fromkeys(("mean", "median", "p90"), float("nan"))
+    return {
+        "mean": float(values.mean()),
+        "median": float(np.median(values)),
+        "p90": float(np.percentile(values, 90)),
+    }
+
+
+def psnr(values: np.ndarray, truth: np.ndarray) -> float:
+    """PSNR in dB with peak 1 of arrays of one shape; NaN when they are empty."""
+    if not truth.size:
+        return float("nan")
+    return float(-10 * np.log10(max(np.mean((np.asarray(values, np.float64) - truth) ** 2), _PEAK_NOISE)))
+
+
+def channel_scaled(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """`values` [N, C] times the factor of each channel that brings them nearest to `truth` in least squares."""
+    return values * ((values * truth).sum(axis=0) / np.maximum((values * values).sum(axis=0), _PEAK_NOISE))
+
+
+def ssim_inside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """Mean structural similarity over the pixels of `mask` [H, W] of two images [H, W] or [H, W, 3] of values in
+    [0, 1]; both are black outside. Data range 1, uniform windows of 7 x 7 pixels, channels averaged. NaN for an empty
+    mask."""
+    if not mask.any():
+        return float("nan")
+    inside = mask if image.ndim == 2 else mask[..., None]
+    axis = None if image.ndim == 2 else 2
+    first, second = (np.where(inside, a, 0).astype(np.float64) for a in (image, truth))
+    similarity = structural_similarity(first, second, data_range=1.0, channel_axis=axis, full=True)[1]
+    return float(similarity[mask].mean())
+
+
+def luminance(values: np.ndarray) -> np.ndarray:
+    """Luminance [...] of linear RGB [..., 3], at least 1e-4, so that it has a logarithm."""
+    return np.maximum(values @ np.array(LUMINANCE), 1e-4)
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's correlation of two arrays [N]; 0 when one of them is constant, NaN of nothing."""
+    if not len(a):
+        return float("nan")
+    if min(a.std(), b.std()) < 1e-9:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def leakage(albedo: np.ndarray, truth: np.ndarray, irradiance: np.ndarray) -> float:
+    """Correlation over points of the error of log albedo luminance with the log luminance of the irradiance, all
+    [N, 3]: positive where shading has gone into the albedo, 0 where none has."""
+    error = np.log(luminance(albedo)) - np.log(luminance(truth))
+    return correlation(error, np.log(luminance(irradiance)))
