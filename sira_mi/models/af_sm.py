@@ -13,13 +13,14 @@ import numpy as np
 from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, in_three, surface
+from sira_mi.fields.sdf import deform, evaluate_in_chunks, in_three, surface
 from sira_mi.models import losses
-from sira_mi.models.avatar import AvatarArchitecture
+from sira_mi.models.avatar import AvatarArchitecture, signed_distance_field
 from sira_mi.models.scenes import TrainingScene
 from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_radiance, skin_tone_loss
 from sira_mi.sg.scene_shading import shade_scenes
 from sira_mi.sg.shading import shade
+from sira_mi.sg.visibility import received
 
 NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
 LATENTS = ("z_a", "z_s", "z_l")
@@ -76,12 +77,8 @@ def freeze_scene(
 ) -> FrozenScene:
     """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at points of a
     scene."""
-    networks = architecture.networks
-    field = SdfField(
-        layers(networks["deformation"], mi.Float(shape["deformation"]), mi.TensorXf(z_sdf[:, None])),
-        layers(networks["reference"], mi.Float(shape["reference"])),
-        architecture.sdf_octaves,
-    )
+    decoders = mi.Float(shape["deformation"]), mi.Float(shape["reference"])
+    field = signed_distance_field(architecture, *decoders, mi.TensorXf(z_sdf[:, None]))
     count = len(scene.points)
     chosen = np.sort(rng.choice(count, min(settings.frozen_points, count), replace=False))
     x = scene.points[chosen].T
@@ -165,8 +162,9 @@ def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.
     return AppearanceBatch(mi.TensorXf(one_hot), len(chosen), skin_radiance=level, **tensor)
 
 
-def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes):
-    """Eq. 8 in closed form: diffuse and specular radiance [3, N] of surface points under `lobes` [N_l, 7].
+def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes, arrival=None):
+    """Eq. 8 in closed form: diffuse and specular radiance [3, N] of surface points under `lobes` [N_l, 7], with shadows
+    and a bounce off surfaces of the same albedo if `arrival` (of `sg.visibility`) is given.
 
     `albedo` [3, N], `specular` [1, N], `roughness` and `k_s` numbers or [1, 1], unit `normals` [3, N], `views` [3, N]
     from the camera to the point. Where a normal faces away from the camera there is no specular radiance."""
@@ -177,7 +175,10 @@ def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes):
         mi.Float(roughness),
         lobes,
     )
-    return albedo * to_columns(irradiance) * (1 / np.pi), to_columns(specular_radiance) * k_s
+    irradiance, specular_radiance = to_columns(irradiance), to_columns(specular_radiance)
+    if arrival is not None:
+        irradiance, specular_radiance = received(irradiance, specular_radiance, arrival, albedo)
+    return albedo * irradiance * (1 / np.pi), specular_radiance * k_s
 
 
 def appearance_losses(architecture, settings: AppearanceTraining, parameters: dict, batch: AppearanceBatch) -> dict:

@@ -1,0 +1,209 @@
+"""Visibility of a light of spherical Gaussians: the share of its diffuse and specular radiance that reaches a point.
+
+Closed-form shading (`sg.shading`) knows no shadows. Here the light's radiance l is also summed over K fixed directions
+ω_k that stand for w_k steradians each, once with and once without what the scene's surfaces block (b_k = 0), and the
+closed form is multiplied by the ratio of the two sums,
+
+    V = Σ_k w_k l(ω_k) f(ω_k) (n·ω_k)₊ b_k / Σ_k w_k l(ω_k) f(ω_k) (n·ω_k)₊,
+
+a colour, for f = 1 (diffuse) and for the specular reflectance: the ratio estimator of Heitz, Hill and McGuire,
+"Combining Analytic Direct Illumination and Stochastic Shadows" (2018), with the same directions at all points, which
+makes it matrix products. A blocked direction shows another surface instead, taken to face the point and to reflect
+diffusely what it receives of the light; this one bounce is kept apart, to be multiplied by the albedo of that surface.
+
+The directions that are open at a point depend on the geometry alone; they are traced once and serve any light.
+"""
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.conventions import LUMINANCE
+from sira_mi.fields.columns import to_columns
+from sira_mi.fields.sdf import in_three
+from sira_mi.sg import brdf
+from sira_mi.sg.integrals import sphere_integral
+from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions, lobe_count, unpack_lobe
+
+# The sharpest lobe that K even directions over the sphere resolve, as a share of K.
+_RESOLVED = 0.25
+# Share of the light's energy that is added to both sums of a ratio, which is then 1 where no light arrives.
+_FLOOR = 1e-6
+# Rays of one launch.
+_LAUNCH = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Directions of a quadrature over the sphere."""
+
+    axis: np.ndarray  # [K, 3] unit
+    weight: np.ndarray  # [K] steradians that each stands for
+    even: int  # how many of them are spread evenly over the sphere
+    resolved: float  # sharper lobes are summed as lobes of this sharpness and of the same energy
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """What arrives of a light at some points, past the surfaces of the scene."""
+
+    diffuse: "mi.TensorXf"  # [3, N] share of the irradiance
+    specular: "mi.TensorXf"  # [3, N] share of the specular radiance
+    bounced_diffuse: "mi.TensorXf"  # [3, N] irradiance from blocking surfaces, per unit of their albedo
+    bounced_specular: "mi.TensorXf"  # [3, N] specular radiance of their light, per unit of their albedo
+
+
+def even_directions(count: int) -> Directions:
+    """`count` directions that serve any light: a Fibonacci lattice. Shadows of lobes sharper than it resolves are
+    blurred."""
+    axis = fibonacci_directions(count)
+    return Directions(axis, np.full(count, 4 * np.pi / count), count, _RESOLVED * count)
+
+
+def light_directions(lobes: np.ndarray, count: int) -> Directions:
+    """`count` directions for the light `lobes` [N_l, 7]: half of them even, half drawn from the lobes in proportion to
+    their energy, without randomness. Every direction stands for the inverse of the joint density (balance heuristic),
+    so that sharp lobes cast sharp shadows."""
+    even = count // 2
+    drawn, energy = _spread_over_lobes(np.asarray(lobes, np.float64), count - even)
+    axis = np.concatenate([fibonacci_directions(even), drawn])
+    density = even / (4 * np.pi) + (count - even) * _mixture_density(lobes.astype(np.float64), energy, axis)
+    return Directions(axis, 1 / density, even, math.inf)
+
+
+def _lobe_frames(lobes):
+    """Unit axes [N_l, 3] and two unit vectors orthogonal to each."""
+    axis = lobes[:, :3] / np.linalg.norm(lobes[:, :3], axis=1, keepdims=True)
+    other = np.where(np.abs(axis[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(axis, other)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return axis, first, np.cross(axis, first)
+
+
+def _spread_over_lobes(lobes, count):
+    """`count` directions [count, 3], spirals through equal shares of the lobes' energy; and the shares [N_l]."""
+    sharpness = np.maximum(lobes[:, 3], 1e-6)
+    energy = (lobes[:, 4:] @ LUMINANCE) * -np.expm1(-2 * sharpness) / sharpness
+    energy = np.full(len(lobes), 1 / len(lobes)) if energy.sum() <= 0 else energy / energy.sum()
+    place = (np.arange(count) + 0.5) / count
+    ends = np.cumsum(energy)
+    lobe = np.minimum(np.searchsorted(ends, place, side="right"), len(lobes) - 1)
+    share = np.clip((place - (ends - energy)[lobe]) / np.maximum(energy[lobe], 1e-12), 0, 1 - 1e-9)
+    gap = np.clip(-np.log1p(share * np.expm1(-2 * sharpness[lobe])) / sharpness[lobe], 0, 2)
+    sine, azimuth = np.sqrt(gap * (2 - gap)), GOLDEN_ANGLE * np.arange(count)
+    axis, first, second = (frame[lobe] for frame in _lobe_frames(lobes))
+    across = np.cos(azimuth)[:, None] * first + np.sin(azimuth)[:, None] * second
+    return (1 - gap)[:, None] * axis + sine[:, None] * across, energy
+
+
+def _mixture_density(lobes, energy, direction):
+    """Density per steradian [K] of `direction` [K, 3] in the mixture of lobes with the shares `energy`."""
+    sharpness = np.maximum(lobes[:, 3], 1e-6)
+    peak = sharpness / (-2 * np.pi * np.expm1(-2 * sharpness))
+    cosine = direction @ _lobe_frames(lobes)[0].T
+    return np.exp(sharpness * np.minimum(cosine - 1, 0)) @ (energy * peak)
+
+
+def trace_open(
+    scene: "mi.Scene", point: np.ndarray, normal: np.ndarray, directions: np.ndarray, offset: float
+) -> np.ndarray:
+    """Whether nothing of the scene lies in each of `directions` [K, 3] from points [3, N] with unit normals [3, N]:
+    bool [K, N]. Directions below the surface count as open. Rays start `offset` scene units above the surface, and as
+    far along themselves again, so that a mesh that is close to the surface does not block its own points."""
+    count, axis = point.shape[1], mi.Float(np.ascontiguousarray(directions, np.float32).ravel())
+    start = [mi.Vector3f(np.ascontiguousarray(v, np.float32)) for v in (point + offset * normal, normal)]
+    step = max(1, _LAUNCH // max(count, 1))
+    parts = []
+    with dr.suspend_grad():
+        for first in range(0, len(directions), step):
+            rows = min(step, len(directions) - first)
+            lane = dr.arange(mi.UInt32, rows * count)
+            column, row = lane % count, first + lane // count
+            direction = mi.Vector3f(*(dr.gather(mi.Float, axis, 3 * row + k) for k in range(3)))
+            origin, up = (dr.gather(mi.Vector3f, v, column) for v in start)
+            ray = mi.Ray3f(mi.Point3f(origin + offset * direction), direction)
+            above = dr.dot(up, direction) > 0.0
+            parts.append((~(above & scene.ray_test(ray, False, above))).numpy().reshape(rows, count))
+    return np.concatenate(parts)
+
+
+def light_radiance(lobes: "mi.TensorXf", directions: Directions) -> "mi.TensorXf":
+    """Radiance [3, K] of `lobes` [N_l, 7] in the directions, lobes widened to what the directions resolve; multiplied
+    by the steradians of each. Differentiable, without atomics."""
+    count = lobe_count(lobes)
+    axis, sharpness, amplitude = unpack_lobe(lobes.array, dr.arange(mi.UInt32, count))
+    if math.isfinite(directions.resolved):
+        wide = dr.minimum(sharpness, directions.resolved)
+        amplitude = amplitude * (sphere_integral(sharpness) / sphere_integral(wide))
+        sharpness = wide
+    ones = dr.full(mi.TensorXf, 1.0, (1, len(directions.axis)))
+    cosine = mi.TensorXf(dr.ravel(axis), (count, 3)) @ _constant(directions.axis.T)
+    exponent = (mi.TensorXf(sharpness, (count, 1)) @ ones) * dr.minimum(cosine - 1.0, 0.0)
+    return (to_columns(amplitude) @ dr.exp(exponent)) * _in_rows(directions.weight, 3)
+
+
+def arrival(
+    normal: "mi.TensorXf",
+    outgoing: "mi.TensorXf",
+    specular: "mi.TensorXf",
+    roughness: "mi.Float",
+    lobes: "mi.TensorXf",
+    directions: Directions,
+    is_open: "mi.TensorXf",
+) -> Arrival:
+    """What arrives of the light `lobes` [N_l, 7] at points with unit normals and outgoing directions [3, N], specular
+    albedo [1, N], and open directions `is_open` [K, N] of 0 and 1.
+
+    Differentiable in all but `is_open`; gradients have the same bits on every run."""
+    light, axis = light_radiance(lobes, directions), _constant(directions.axis)
+    cosine, ones = axis @ normal, dr.full(mi.TensorXf, 1.0, (len(directions.axis), 1))
+    light_cosine = dr.maximum(cosine, 0.0)
+    diffuse, bounced_diffuse = _sums(light, directions, cosine, light_cosine, is_open)
+
+    view_cosine = dr.full(mi.TensorXf, 1.0, (1, 3)) @ (normal * outgoing)
+    # Flat arrays, in which a roughness of one entry needs no broadcast of tensors, whose adjoint would be atomic.
+    rough = dr.maximum(mi.Float(roughness), (2.0 / directions.even) ** 0.25)
+    half = dr.sqrt(dr.maximum(2.0 + 2.0 * (axis @ outgoing).array, 1e-6))
+    gap = dr.maximum(1.0 - (cosine + ones @ view_cosine).array / half, 0.0)
+    reflectance = brdf.distribution(gap, rough) * brdf.fresnel((ones @ specular).array, 0.5 * half)
+    reflectance *= brdf.visibility(light_cosine.array, rough) * light_cosine.array
+    glossy, bounced_glossy = _sums(light, directions, cosine, mi.TensorXf(reflectance, cosine.shape), is_open)
+    masking = 0.25 * brdf.visibility(dr.maximum(view_cosine.array, 0.0), rough)
+    masking = mi.TensorXf(dr.select(view_cosine.array > 0.0, masking, 0.0), view_cosine.shape)
+    return Arrival(diffuse, glossy, bounced_diffuse, bounced_glossy * in_three(masking))
+
+
+def _sums(light, directions, cosine, weight, is_open):
+    """Share [3, N] of `light` [3, K] that arrives under weights [K, N], and the sum [3, N] of what bounces.
+
+    The surface seen in a blocked direction ω_k receives light from ω_l by (−ω_k·ω_l)₊, for which its expansion to first
+    order, ¼ − ½ ω_k·ω_l, is summed over k first and then cut at 0. Light from below the point's own horizon mostly does
+    not reach its neighbours either: it fades with 1 + n·ω_l."""
+    floor = dr.detach(dr.sum(light, axis=None)) * _FLOOR + 1e-20
+    arriving = weight * is_open
+    share = (light @ arriving + floor) / (light @ weight + floor)
+    moments = np.concatenate([0.25 * directions.weight[None], -0.5 * directions.weight * directions.axis.T])
+    onto = np.concatenate([np.ones((1, len(directions.axis))), directions.axis.T])
+    received = dr.maximum(_constant(onto.T) @ (_constant(moments) @ (weight - arriving)), 0.0)
+    fading = dr.minimum(1.0 + cosine, 1.0)
+    return share, (light @ (received * fading)) * (1 / math.pi)
+
+
+def received(irradiance, specular, arrival: Arrival, bounce_albedo) -> tuple["mi.TensorXf", "mi.TensorXf"]:
+    """Irradiance and specular radiance [3, N] with visibility, of those of the closed form and what arrives;
+    `bounce_albedo` [3, N], or a number, is the diffuse albedo of the surfaces that block."""
+    return (
+        irradiance * arrival.diffuse + arrival.bounced_diffuse * bounce_albedo,
+        specular * arrival.specular + arrival.bounced_specular * bounce_albedo,
+    )
+
+
+def _in_rows(array, rows):
+    return _constant(np.repeat(array[None], rows, axis=0))
+
+
+def _constant(array):
+    return mi.TensorXf(np.ascontiguousarray(array, np.float32))
