@@ -106,6 +106,8 @@ class NeuralAlbedo(mi.Texture):
     def bind(self, architecture, deformation, z_sdf, to_local) -> None:
         """Takes the reference space from a shape: its deformation network (flat parameters), its latent, and the
         transform from world to the field's coordinates."""
+        if not architecture.deforms:
+            raise ValueError("neural_albedo: this avatar has no deformation, and so no reference space for albedos")
         column = mi.TensorXf(z_sdf, (len(z_sdf), 1))
         self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
         self._to_local = to_local

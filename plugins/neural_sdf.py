@@ -5,12 +5,9 @@ import numpy as np
 from sira_mi.fields import tracing
 from sira_mi.fields.columns import scatter_columns, to_columns
 from sira_mi.fields.extraction import extract
-from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, signed_distance, surface
-from sira_mi.models.avatar import load_avatar
+from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, rigid_motion, signed_distance, surface
+from sira_mi.models.avatar import load_avatar, signed_distance_field
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
-
-_FIELD_KEYS = ("deformation", "reference", "z_sdf")
 
 
 class NeuralSDF(mi.Mesh):
@@ -33,6 +30,9 @@ class NeuralSDF(mi.Mesh):
        - The mesh is extracted again at every n-th update of the parameters. With 1, it also carries gradients. With
          more, it stays where it is in between and carries none: for integrators that refine hits on the field
          itself. (Default: 1)
+     * - movable
+       - |bool|
+       - Whether `pose` is exposed. (Default: false)
      * - to_world
        - |transform|
        - Rotation, translation and uniform scale. (Default: identity)
@@ -43,6 +43,11 @@ class NeuralSDF(mi.Mesh):
      * - z_sdf
        - |Float|
        - Shape latent.
+       - |exposed|, |differentiable|, |discontinuous|
+     * - pose
+       - |Float|
+       - Rotation vector (radians) and translation (scene units) of points before they enter the field: moves the head
+         by the inverse. Exposed where the shape is `movable`.
        - |exposed|, |differentiable|, |discontinuous|
      * - (Nested plugin)
        - |bsdf|
@@ -90,13 +95,20 @@ class NeuralSDF(mi.Mesh):
         super().__init__(props.id() or "neural_sdf", 1, 1, props=props, has_vertex_normals=True)
         self.to_world = mi.Transform4f(matrix)
         self.to_local = self.to_world.inverse()
+        self._matrix_to_local = np.linalg.inv(matrix)
         self.architecture = avatar.architecture
+        self._keys = ("deformation", "reference", "z_sdf")
         self.deformation = mi.Float(avatar.tensors["deformation"])
         self.reference = mi.Float(avatar.tensors["reference"])
         self.z_sdf = mi.Float(avatar.tensors["z_sdf"])
+        if props.get("movable", False):
+            self._keys += ("pose",)
+            self.pose = mi.Float(np.zeros(6, np.float32))
         self._updates = 0
         self._last_hits = None
         self._textures = [node for node in mi.traverse(self.bsdf()).hierarchy if isinstance(node, NeuralAlbedo)]
+        if self._textures and "pose" in self._keys:
+            raise ValueError("neural_sdf: a movable head cannot carry a neural_albedo, which does not move with it")
         self._bind_textures()
         self._extract()
         self._add_attributes()
@@ -104,12 +116,9 @@ class NeuralSDF(mi.Mesh):
 
     def field(self) -> SdfField:
         """The field's layers at the current parameters; differentiable where those are."""
-        networks, latent = self.architecture.networks, self.z_sdf
-        return SdfField(
-            layers(networks["deformation"], self.deformation, mi.TensorXf(latent, (len(latent), 1))),
-            layers(networks["reference"], self.reference),
-            self.architecture.sdf_octaves,
-        )
+        z_sdf = mi.TensorXf(self.z_sdf, (len(self.z_sdf), 1))
+        motion = rigid_motion(mi.TensorXf(self.pose, (6, 1))) if "pose" in self._keys else None
+        return signed_distance_field(self.architecture, self.deformation, self.reference, z_sdf, motion)
 
     def vertices(self) -> np.ndarray:
         """Vertices [3, V] of the mesh in the field's coordinates."""
@@ -126,31 +135,30 @@ class NeuralSDF(mi.Mesh):
         index = dr.compress(active)
         if dr.width(index) == 0:
             return t, dr.zeros(mi.Bool, width)
-        local = self.to_local @ dr.detach(ray)
-        columns = [to_columns(dr.gather(type(a), a, index)).numpy() for a in (local.o, local.d, mi.Float(t))]
-        exact, f = self._newton(columns)
+        ray = dr.detach(ray)
+        origin, direction, start = (
+            to_columns(dr.gather(type(a), a, index)).numpy().astype(np.float64) for a in (ray.o, ray.d, mi.Float(t))
+        )
+        # From the proxy's hit on: single precision does not resolve 0.01 mm at a camera's distance.
+        matrix = self._matrix_to_local
+        base = matrix[:3, :3] @ (origin + start * direction) + matrix[:3, 3:]
+        columns = [a.astype(np.float32) for a in (base, matrix[:3, :3] @ direction, 0 * start)]
+        step, f = self._newton(columns)
         hit = dr.zeros(mi.Bool, width)
         dr.scatter(hit, mi.Bool(np.abs(f[0]) < tracing.HIT_TOLERANCE), index)
+        exact = (start + step).astype(np.float32)
         return scatter_columns(mi.TensorXf(exact), index, width, mi.Float), hit
 
     def _newton(self, columns: list[np.ndarray]) -> list[np.ndarray]:
         """Newton hits of rays [3, N], [3, N] from [1, N]. The last result is kept: `mi.render` traces the same rays
         once for the picture and once more for its derivative."""
-        parameters = tuple(dr.detach(getattr(self, key)) for key in _FIELD_KEYS)
+        parameters = tuple(dr.detach(getattr(self, key)) for key in self._keys)
         if self._last_hits is not None:
             rays, then, result = self._last_hits
             same_field = all(a.index == b.index for a, b in zip(parameters, then, strict=True))
             if same_field and all(np.array_equal(a, b) for a, b in zip(columns, rays, strict=True)):
                 return result
-        field = self.field()
-        result = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), *columns)
-        stray = np.flatnonzero(np.abs(result[1][0]) >= tracing.HIT_TOLERANCE)
-        if len(stray):
-            o, d, start = (c[:, stray] for c in columns)
-            (t,) = evaluate_in_chunks(lambda o, d, t: tracing.first_crossings(field, o, d, t), o, d, start)
-            found = evaluate_in_chunks(lambda o, d, t: tracing.newton_hits(field, o, d, t), o, d, np.minimum(t, 1e4))
-            for whole, part in zip(result, found, strict=True):
-                whole[:, stray] = part
+        result = tracing.refined_hits(tracing.with_unit_gradient(self.field(), self._gradient_length), *columns)
         self._last_hits = (columns, parameters, result) if columns[2].size <= CHUNK else None
         return result
 
@@ -171,12 +179,14 @@ class NeuralSDF(mi.Mesh):
             x = x - np.where(moved, np.clip(step, -0.5 * self.voxel, 0.5 * self.voxel), 0)
         self._x0 = mi.TensorXf(np.ascontiguousarray(x, np.float32))
         self._gradient = np.where(moved, gradient, 0)
+        lengths = np.linalg.norm(gradient[:, moved], axis=0)
+        self._gradient_length = max(float(np.median(lengths)), 1e-3) if moved.any() else 1.0
         self._faces = mi.UInt32(extracted.faces.ravel())
 
     def _attach(self) -> None:
         """Sets the mesh to the extracted vertices, attached to those parameters that have gradients enabled."""
         x = self._x0
-        if any(dr.grad_enabled(getattr(self, key)) for key in _FIELD_KEYS):
+        if any(dr.grad_enabled(getattr(self, key)) for key in self._keys):
             f = signed_distance(self.field(), x)
             weight = self._gradient / np.maximum((self._gradient**2).sum(axis=0), 1e-4)
             x = x - mi.TensorXf(weight.astype(np.float32)) * (f - dr.detach(f))
@@ -218,11 +228,11 @@ class NeuralSDF(mi.Mesh):
 
     def traverse(self, callback):
         super().traverse(callback)
-        for key in _FIELD_KEYS:
+        for key in self._keys:
             callback.put(key, getattr(self, key), mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
     def parameters_changed(self, keys=()):
-        if not any(key in keys for key in _FIELD_KEYS):
+        if not any(key in keys for key in self._keys):
             super().parameters_changed(keys)
             if any(texture.changed for texture in self._baked.values()):
                 self._renew_attributes()

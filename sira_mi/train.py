@@ -16,7 +16,17 @@ from sira_mi.errors import InputError, run_command
 from sira_mi.models.avatar import AvatarArchitecture
 
 # The loss terms of each model whose weight λ is a setting of that name.
-SHAPE_TERMS = ("surface", "normal", "distance", "eikonal", "deformation", "landmark", "color", "embedding")
+SHAPE_TERMS = (
+    "surface",
+    "normal",
+    "distance",
+    "eikonal",
+    "random_eikonal",
+    "deformation",
+    "landmark",
+    "color",
+    "embedding",
+)
 APPEARANCE_TERMS = ("embedding", "smoothness", "specular_anchor", "white_light", "skin_tone")
 
 
@@ -62,7 +72,9 @@ def parse_sizes(items: list[str]) -> dict[str, int]:
             raise InputError(f"--architecture {item}: unknown size {name!r}; known are {', '.join(names)}")
         if not value.isascii() or not value.isdigit():
             raise InputError(f"--architecture {item}: give a whole number, e.g. {name}=64")
-        sizes[name] = int(value)
+        if name == "deforms" and value not in ("0", "1"):
+            raise InputError(f"--architecture {item}: deforms is 0 or 1")
+        sizes[name] = bool(int(value)) if name == "deforms" else int(value)
     return sizes
 
 
@@ -114,11 +126,15 @@ def train_shape(
     picture_steps: int = 1000,
     scenes: list | None = None,
 ) -> dict[str, np.ndarray]:
-    """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
+    """Trains the SA-SM; returns its networks and latents [dim, scenes]. A field without deformation has no reference
+    space for albedos: `out/prior.safetensors` is written at once then, with untrained appearance. `without` names a loss term to leave out,
     `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
     from sira_mi.models import sa_sm
+    from sira_mi.models.af_sm import initial_appearance_model
+    from sira_mi.models.avatar import save_avatar
     from sira_mi.models.optimisation import adam
     from sira_mi.models.pictures import shape_picture
+    from sira_mi.models.prior import assemble_prior
     from sira_mi.models.scenes import load_training_scenes
     from sira_mi.models.shape_model import ShapeModel
     from sira_mi.models.training import run_training
@@ -133,16 +149,16 @@ def train_shape(
 
     def step(number: int) -> dict[str, float]:
         batch = sa_sm.draw_batch(scenes, settings, np.random.default_rng([seed, 2, number]))
-        return sa_sm.training_step(architecture, settings, optimizer, batch)
+        return sa_sm.training_step(architecture, sa_sm.weights_at(settings, number), optimizer, batch)
 
     def picture(path: Path, parameters: dict[str, np.ndarray]) -> None:
         model = ShapeModel.of_training(architecture, parameters)
         shape_picture(path, model, parameters["z_sdf"], scenes, seed)
 
-    return run_training(
+    trained = run_training(
         out,
         "shape",
-        settings.steps,
+        sa_sm.all_steps(settings),
         optimizer,
         lambda k: sa_sm.rates(settings, k),
         step,
@@ -151,6 +167,11 @@ def train_shape(
         picture=picture,
         picture_steps=picture_steps,
     )
+    if not architecture.deforms:
+        appearance = initial_appearance_model(architecture, len(scenes), seed)
+        landmarks = np.stack([scene.landmarks for scene in scenes])
+        save_avatar(out / "prior.safetensors", assemble_prior(architecture, trained, appearance, landmarks, 0.5, seed))
+    return trained
 
 
 def train_appearance(
@@ -181,6 +202,8 @@ def train_appearance(
         raise InputError(f"{checkpoint} is missing; run python -m sira_mi.train shape first")
     shape, metadata = trained_parameters(checkpoint)
     trained = read_architecture(metadata, checkpoint)
+    if not trained.deforms:
+        raise InputError(f"{checkpoint} has no deformation, and so no reference space for albedos")
     architecture = with_sizes(trained, sizes or {})
     frozen_sizes = ("features", "sdf_", "rendering_")
     for name in sizes or {}:

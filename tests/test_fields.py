@@ -1,11 +1,14 @@
 """Networks in both modes, derivatives of the field, extraction and tracing: against differences and slow references."""
 
+import dataclasses
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
 from conftest import SMALL, slopes
+from scipy.spatial.transform import Rotation
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields import appearance, extraction, mlp, sdf, tracing
@@ -283,6 +286,43 @@ def test_gradient_of_the_field_equals_differences_in_float64(avatar):
     again = sdf.deform(head_field(avatar), mi.TensorXf(x))
     np.testing.assert_allclose(again[0].numpy(), x_ref, atol=1e-6)
     np.testing.assert_allclose(again[1].numpy(), gamma, atol=1e-6)
+
+
+def test_a_rigid_motion_is_one_and_carries_the_field_along(avatar):
+    """(R | t) is a rotation for any vector, by that vector's angle for small ones; value and gradient of the moved
+    field are those of the field at the moved point."""
+    vector = np.array([0.3, -0.2, 0.1, 0.05, -0.1, 0.2], np.float32)
+    motion = sdf.rigid_motion(mi.TensorXf(vector.reshape(6, 1)))
+    matrix = motion.numpy()
+    assert np.allclose(matrix[:, :3] @ matrix[:, :3].T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(matrix[:, :3]) == pytest.approx(1, abs=1e-6)
+    expected = Rotation.from_rotvec(vector[:3]).as_matrix()
+    assert np.allclose(matrix[:, :3], expected, atol=np.linalg.norm(vector[:3]) ** 3 / 10)
+    still = head_field(avatar)
+    moved = dataclasses.replace(still, motion=motion)
+    x = points_near_surface(40)
+    there = mi.TensorXf(np.ascontiguousarray(matrix[:, :3] @ x + matrix[:, 3:]))
+    f, gradient, x_ref, gamma = (v.numpy() for v in sdf.surface(moved, mi.TensorXf(x)))
+    g, slope, y_ref, delta = (v.numpy() for v in sdf.surface(still, there))
+    for a, b in ((f, g), (gradient, matrix[:, :3].T @ slope), (x_ref, y_ref), (gamma, delta)):
+        assert np.allclose(a, b, atol=1e-5)
+
+
+def test_derivative_by_the_pose_equals_differences(avatar):
+    """What the fit's pose is found by."""
+    still, x = head_field(avatar), mi.TensorXf(points_near_surface(40))
+    weight = mi.TensorXf(np.random.default_rng(1).standard_normal((1, 40)).astype(np.float32))
+
+    def loss(pose):
+        field = dataclasses.replace(still, motion=sdf.rigid_motion(mi.TensorXf(mi.Float(pose), (6, 1))))
+        return dr.sum(sdf.surface(field, x)[0] * weight, axis=None)
+
+    pose = np.array([0.1, -0.05, 0.2, 0.03, 0.01, -0.02], np.float32)
+    attached = mi.Float(pose)
+    dr.enable_grad(attached)
+    dr.backward(loss(attached))
+    analytic, difference = slopes(lambda p: loss(p).numpy().item(), pose, attached.grad.numpy(), 0.05)
+    assert analytic == pytest.approx(difference, rel=5e-3)
 
 
 @pytest.mark.parametrize("name", ["deformation", "reference", "z_sdf"])

@@ -12,6 +12,7 @@ from conftest import SMALL
 from sira_mi import train
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import extract
+from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.models import af_sm, pictures, sa_sm, training
 from sira_mi.models.avatar import AvatarArchitecture, load_avatar
 from sira_mi.models.optimisation import adam, read_arrays
@@ -77,7 +78,7 @@ def collection(tmp_path_factory):
 def run(collection, tmp_path_factory):
     """Both models, a few steps by the command."""
     out = tmp_path_factory.mktemp("run")
-    sizes = ["--architecture", *(f"{k}={v}" for k, v in SIZES.items())]
+    sizes = ["--architecture", *(f"{k}={int(v)}" for k, v in SIZES.items())]
     for model, steps in (("shape", 8), ("appearance", 4)):
         arguments = [model, "--collection", str(collection), "--out", str(out), "--steps", str(steps)]
         command(*arguments, *(sizes if model == "shape" else []))
@@ -93,6 +94,52 @@ def command(*arguments: str) -> None:
 
 
 # Options
+
+
+def test_finishing_steps_follow_at_lower_rates_and_with_more_eikonal():
+    """The steps before them are those of a training without them; after the last one nothing is left to do."""
+    settings = sa_sm.ShapeTraining(steps=80, finishing=0.25, finishing_rate=0.5, finishing_eikonal=3.0)
+    plain = dataclasses.replace(settings, finishing=0.0)
+    assert (sa_sm.all_steps(settings), sa_sm.all_steps(plain)) == (100, 80)
+    assert all(sa_sm.rates(settings, k) == sa_sm.rates(plain, k) for k in range(80))
+    assert sa_sm.rates(settings, 80)["reference"] == pytest.approx(0.5 * settings.learning_rate)
+    assert sa_sm.rates(settings, 99)["reference"] < 0.1 * sa_sm.rates(settings, 80)["reference"]
+    assert sa_sm.weights_at(settings, 79) == settings
+    finishing = sa_sm.weights_at(settings, 80)
+    assert (finishing.eikonal, finishing.random_eikonal) == (3 * settings.eikonal, 3 * settings.random_eikonal)
+    assert finishing.surface == settings.surface
+
+
+def test_random_heads_have_the_mean_and_the_covariance_of_the_latents():
+    """Otherwise the eikonal term would be trained on other heads than those that a prior gives."""
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((3, 3)) @ rng.standard_normal((3, 24)) + [[1], [2], [3]]
+    drawn = np.concatenate([z @ sa_sm.gaussian_mixture(24, rng) for _ in range(400)], axis=1)
+    assert np.allclose(drawn.mean(axis=1), z.mean(axis=1), atol=0.1)
+    assert np.allclose(np.cov(drawn), np.cov(z, bias=True), rtol=0.1, atol=0.2)
+
+
+def test_a_field_without_deformation_is_a_prior_for_the_ablation(collection, tmp_path):
+    """Its reference space is space itself, and its shape is the latent's all the same."""
+    sizes = [f"{k}={int(v)}" for k, v in {**SIZES, "deforms": 0}.items()]
+    arguments = ["--collection", str(collection), "--out", str(tmp_path), "--steps", "8", "--architecture", *sizes]
+    command("shape", *arguments)
+    prior = load_avatar(tmp_path / "prior.safetensors")
+    assert not prior.architecture.deforms
+    x = np.random.default_rng(0).standard_normal((3, 20)).astype(np.float32)
+    model = ShapeModel.of_prior(prior)
+    values = []
+    for w in (0, 3):
+        field = model.field(np.full(SMALL.sdf_latent, w, np.float32))
+        f, gradient, x_ref, _ = surface(field, mi.TensorXf(x))
+        assert np.allclose(x_ref.numpy(), x)
+        step = 1e-2 * gradient.numpy() / np.linalg.norm(gradient.numpy(), axis=0)
+        ahead, behind = (signed_distance(field, mi.TensorXf(x + s * step)).numpy() for s in (1, -1))
+        assert np.allclose((ahead - behind) / 2e-2, np.linalg.norm(gradient.numpy(), axis=0), rtol=2e-2)
+        values.append(f.numpy())
+    assert np.abs(values[1] - values[0]).max() > 1e-3
+    with pytest.raises(InputError, match="no reference space"):
+        command("appearance", "--collection", str(collection), "--out", str(tmp_path), "--steps", "2")
 
 
 def test_the_terms_that_can_be_left_out_are_those_of_the_losses(collection):
@@ -141,7 +188,7 @@ def test_sizes_replace_those_of_the_architecture():
 def test_the_command_trains_both_models_at_the_given_sizes(run, collection):
     parameters, metadata = trained_parameters(run / "shape.checkpoint")
     assert train.read_architecture(metadata, run / "shape.checkpoint") == SMALL
-    assert metadata["step"] == "8" and parameters["z_sdf"].shape == (SMALL.sdf_latent, 3)
+    assert metadata["step"] == "10" and parameters["z_sdf"].shape == (SMALL.sdf_latent, 3)
     assert load_avatar(run / "prior.safetensors").architecture == SMALL
     for name in ("shape_000008", "appearance_000004"):
         from PIL import Image

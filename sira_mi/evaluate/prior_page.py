@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from sira_mi.evaluate.cache import read
+from sira_mi.evaluate.markdown import average, number, percent, table
 from sira_mi.evaluate.shape_prior import DISC_RADIUS, REGIONS
 from sira_mi.files import write_through
+from sira_mi.models.avatar import AvatarArchitecture
 
 COMMANDS = """    python -m sira_mi.train shape --collection COLLECTION --out RUNS
     python -m sira_mi.train appearance --collection COLLECTION --out RUNS
@@ -27,38 +29,12 @@ PURPOSES = {
     "normal": "turns the gradient to the scan's normals",
     "distance": "sets the distance away from the surface",
     "eikonal": "keeps the gradient at length 1",
+    "random_eikonal": "the same for heads between the trained ones",
     "deformation": "keeps the deformation small",
     "landmark": "brings landmarks together in reference space",
     "color": "ties the reference space to colour",
     "embedding": "keeps the latents small",
 }
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-
-
-def number(value: float, digits: int = 2) -> str:
-    """A number with `digits` decimals; a dash for NaN."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
-
-
-def percent(value: float) -> str:
-    return f"{100 * value:.0f}%"
-
-
-def average(rows: Sequence[dict], *path: str) -> float:
-    """The mean over rows of the number at a path of keys, NaN left out."""
-    values = []
-    for row in rows:
-        value = row
-        for key in path:
-            value = value[key]
-        values.append(value)
-    values = np.array(values, float)
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 def _result(evidence: Path, name: str) -> dict | None:
@@ -273,10 +249,11 @@ def sizes_section(evidence: Path) -> str:
         for r in results
     ]
     head = [*names, "face, mm", "head, mm", "normals, °", "parameters", "distance, µs", "with derivatives, µs"]
+    shipped = ", ".join(f"{name} {getattr(AvatarArchitecture(), name)}" for name in names)
     return f"""Each trained for {results[0]["steps"]} steps and measured on {results[0]["scans"]} test scans as the
-ablations are; the first row is the shipped architecture. Costs are microseconds a point: the signed distance alone,
-and distance and gradient with the derivative of a loss on both by all parameters. On a shared machine they vary by a
-third from run to run.
+ablations are; the rows differ in one size each from the first. Shipped: {shipped}.
+Costs are microseconds a point: the signed distance alone, and distance and gradient with the derivative of a loss on
+both by all parameters. On a shared machine they vary by a third from run to run.
 
 {table(head, lines)}"""
 

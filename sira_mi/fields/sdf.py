@@ -3,6 +3,8 @@
 All functions work on tensors `[rows, N]`, one column a point, coordinates in scene units.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,11 +20,14 @@ CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class SdfField:
-    """The unpacked layers of both networks, the deformation's conditioned on z_sdf."""
+    """The unpacked layers of both networks, the deformation's conditioned on z_sdf. Without a deformation (H3D-Net's
+    field, the baseline of the paper's ablation) the first network gives γ only, and the second is conditioned."""
 
     deformation: list[tuple]
     reference: list[tuple]
     octaves: int  # of the positional encoding of x and of x_ref
+    deforms: bool = True
+    motion: mi.TensorXf | None = None  # [3, 4] rigid, of points before they enter the networks; None for none
 
 
 def sphere_parameters(architecture: Architecture, rng: np.random.Generator, radius: float) -> np.ndarray:
@@ -42,15 +47,34 @@ def sphere_parameters(architecture: Architecture, rng: np.random.Generator, radi
     return np.concatenate(pieces).astype(np.float32)
 
 
-def _split(deformation):
-    """Outputs of the deformation network [3 + N_γ, N] -> (δ [3, N], γ [N_γ, N])."""
-    return deformation[:3, :], deformation[3:, :]
+def rigid_motion(pose):
+    """[3, 4] matrix (R | t) of a pose [6, 1]: the rotation's vector in radians (exact to third order, a rotation for
+    any), and t in scene units."""
+    half = 0.5 * pose[0:3, :]
+    w = 1 / dr.sqrt(1 + dr.sum(half * half, axis=0))
+    w = dr.reshape(w, (1, 1))
+    x, y, z = (w * half[k : k + 1, :] for k in range(3))
+    one = w * 0 + 1
+    rows = (
+        (one - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), one - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), one - 2 * (x * x + y * y)),
+    )
+    return dr.concat([dr.concat([*row, pose[3 + k : 4 + k, :]], axis=1) for k, row in enumerate(rows)], axis=0)
+
+
+def _moved(field: SdfField, x):
+    """Points [3, N] as the networks see them. One product: a broadcast's adjoint would be summed by atomics."""
+    if field.motion is None:
+        return x
+    return field.motion @ dr.concat([x, dr.full(mi.TensorXf, 1.0, (1, x.shape[1]))], axis=0)
 
 
 def deform(field: SdfField, x):
     """Eqs 1 and 2a: x [3, N] -> (x_ref = x + δ [3, N], γ [N_γ, N])."""
-    delta, gamma = _split(evaluate(field.deformation, encode(x, field.octaves)))
-    return x + delta, gamma
+    x = _moved(field, x)
+    h = evaluate(field.deformation, encode(x, field.octaves))
+    return (x + h[:3, :], h[3:, :]) if field.deforms else (x, h)
 
 
 def signed_distance(field: SdfField, x):
@@ -60,11 +84,16 @@ def signed_distance(field: SdfField, x):
 
 
 def _with_tangents(field: SdfField, x, tangents: list):
-    h, t = encode_with_tangents(x, tangents, field.octaves)
-    h, t = evaluate_with_tangents(field.deformation, h, t)
-    delta, gamma = _split(h)
-    x_ref = x + delta
-    h, t = encode_with_tangents(x_ref, [a + _split(b)[0] for a, b in zip(tangents, t, strict=True)], field.octaves)
+    x = _moved(field, x)
+    if field.motion is not None:
+        tangents = [field.motion[:, 0:3] @ t for t in tangents]
+    if field.deforms:
+        h, t = evaluate_with_tangents(field.deformation, *encode_with_tangents(x, tangents, field.octaves))
+        x_ref, gamma = x + h[:3, :], h[3:, :]
+        tangents = [a + b[:3, :] for a, b in zip(tangents, t, strict=True)]
+    else:
+        x_ref, gamma = x, evaluate(field.deformation, encode(x, field.octaves))
+    h, t = encode_with_tangents(x_ref, tangents, field.octaves)
     value, slopes = evaluate_with_tangents(field.reference, h, t)
     return value, slopes, x_ref, gamma
 

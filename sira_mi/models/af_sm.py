@@ -30,16 +30,16 @@ LATENTS = ("z_a", "z_s", "z_l")
 class AppearanceTraining:
     """Settings of the AF-SM training; λ as in eq. 10."""
 
-    steps: int = 4000
+    steps: int = 8000
     scenes: int = 24  # scenes a step: more of them and fewer points, so that latents are visited often
     points: int = 128  # a scene and step
     frozen_points: int = 6000  # of each scene's points, drawn once, at which the frozen deformation is evaluated
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
     latent_rate: float = 4e-3  # of the latents
     roughness: float = 0.5  # of skin (FLARE: 0.5 ± 0.1), fixed
-    jitter: float = 0.03  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
+    jitter: float = 0.015  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
-    smoothness: float = 0.05  # λ7 (NeRFactor)
+    smoothness: float = 0.01  # λ7 (NeRFactor 0.05)
     specular_anchor: float = 0.01  # pull of the log specular albedo to that of skin, which images hardly determine
     white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
     skin_tone: float = 1e-3  # on the deviations of a face's skin albedo from measured skin, which settles the

@@ -17,7 +17,8 @@ from safetensors.numpy import save
 
 from sira_mi.errors import InputError
 from sira_mi.fields.encoding import encoded_size
-from sira_mi.fields.mlp import Architecture
+from sira_mi.fields.mlp import Architecture, layers
+from sira_mi.fields.sdf import SdfField
 from sira_mi.files import write_through
 
 FORMAT = "sira-mi avatar 1"
@@ -32,10 +33,11 @@ class AvatarArchitecture:
     """Sizes of all decoders; octaves belong to the positional encoding of each network's point."""
 
     features: int = 16  # N_γ, length of the auxiliary feature vector γ
-    sdf_octaves: int = 6
+    sdf_octaves: int = 4
     sdf_width: int = 96
     sdf_depth: int = 4
-    sdf_latent: int = 64  # dimension of z_sdf
+    sdf_latent: int = 128  # dimension of z_sdf
+    deforms: bool = True  # eqs 1-3; without, one field conditioned on z_sdf (H3D-Net, the ablation's baseline)
     rendering_octaves: int = 5
     rendering_width: int = 96
     rendering_depth: int = 3
@@ -57,8 +59,11 @@ class AvatarArchitecture:
     illumination_latent: int = 24  # dimension of z_l
 
     def __post_init__(self):
-        if any(not isinstance(v, int) or not 0 < v <= 4096 for v in dataclasses.asdict(self).values()):
+        sizes = {k: v for k, v in dataclasses.asdict(self).items() if k != "deforms"}
+        if any(not isinstance(v, int) or not 0 < v <= 4096 for v in sizes.values()):
             raise ValueError("every size of an avatar is a whole number from 1 to 4096")
+        if not isinstance(self.deforms, bool):
+            raise ValueError("deforms is true or false")
 
     @cached_property
     def networks(self) -> dict[str, Architecture]:
@@ -68,8 +73,8 @@ class AvatarArchitecture:
         albedo = encoded_size(self.albedo_octaves) + gamma
         width, depth = self.sdf_width, self.sdf_depth
         return {
-            "deformation": Architecture(sdf, 3 + gamma, width, depth, self.sdf_latent),
-            "reference": Architecture(sdf, 1, width, depth),
+            "deformation": Architecture(sdf, 3 * self.deforms + gamma, width, depth, self.sdf_latent),
+            "reference": Architecture(sdf, 1, width, depth, 0 if self.deforms else self.sdf_latent),
             "rendering": Architecture(
                 encoded_size(self.rendering_octaves) + 6 + gamma,
                 3,
@@ -103,6 +108,19 @@ class AvatarArchitecture:
             "z_s": self.specular_latent,
             "z_l": self.illumination_latent,
         }
+
+
+def signed_distance_field(architecture: AvatarArchitecture, deformation, reference, z_sdf, motion=None) -> SdfField:
+    """The field of flat parameters of both networks and of shape latents, a tensor [dim, S]; `motion` as in
+    `SdfField`."""
+    networks, deforms = architecture.networks, architecture.deforms
+    return SdfField(
+        layers(networks["deformation"], deformation, z_sdf),
+        layers(networks["reference"], reference, None if deforms else z_sdf),
+        architecture.sdf_octaves,
+        deforms,
+        motion,
+    )
 
 
 @dataclass(frozen=True)

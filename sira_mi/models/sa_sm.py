@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,13 +11,16 @@ import numpy as np
 from sira_mi.errors import InputError
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import SdfField, deform, normalised, sphere_parameters, surface
+from sira_mi.fields.sdf import deform, normalised, sphere_parameters, surface
 from sira_mi.models import losses
-from sira_mi.models.avatar import AvatarArchitecture
+from sira_mi.models.avatar import AvatarArchitecture, signed_distance_field
 from sira_mi.models.scenes import TrainingScene
 
 NETWORKS = ("deformation", "reference", "rendering")
 LATENTS = ("z_sdf", "z_r")
+
+# Deviation of the random heads' points from the scenes' surfaces, scene units.
+_JITTER = 0.1
 
 
 @dataclass(frozen=True)
@@ -25,9 +28,13 @@ class ShapeTraining:
     """Settings of the SA-SM training; λ as in eq. 7."""
 
     steps: int = 10_000
+    finishing: float = 0.25  # as many steps again, of `steps`, in which the gradient is brought to length 1
+    finishing_rate: float = 0.25  # of the learning rates in these, which fall anew
+    finishing_eikonal: float = 10.0  # both eikonal weights in these, times
     scenes: int = 32  # scenes a step
     surface_points: int = 96  # a scene and step
     volume_points: int = 32  # a scene and step
+    random_points: int = 24  # of a random head, a step; as many random heads as scenes
     landmarks: int = 24  # a scene and step
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
     latent_rate: float = 4e-3  # of the latents
@@ -36,6 +43,7 @@ class ShapeTraining:
     normal: float = 0.3  # normals of the scans (IGR, NPHM)
     distance: float = 0.4  # signed distance of the volume points: clears other heads' hair from free space
     eikonal: float = 0.2  # λ1 (NPHM 0.1), at surface and volume points
+    random_eikonal: float = 0.2  # the same of random heads: latents from the Gaussian of the scenes' latents
     deformation: float = 2e-3  # λ2 (i3DMM 1e-4, there on other units)
     landmark: float = 0.5  # λ3 (i3DMM 1.0)
     color: float = 0.25  # λ4 (i3DMM)
@@ -70,6 +78,8 @@ class ShapeBatch:
     colors: mi.TensorXf  # [3, S·n]
     volume_distance: mi.TensorXf  # [1, S·q]
     landmarks: mi.TensorXf  # [3, S·l]
+    mixture: mi.TensorXf  # [S, S]: its columns take the latents of the scenes to those of random heads
+    random_points: mi.TensorXf  # [3, S·r]: of each random head r points about the heads of all scenes
 
 
 def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.random.Generator) -> ShapeBatch:
@@ -93,8 +103,19 @@ def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.ran
         parts["landmarks"].append(scene.landmarks[landmarks])
     one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
     one_hot[chosen, np.arange(len(chosen))] = 1
+    on_surface = np.concatenate(parts["points"][::2])
+    near = on_surface[rng.integers(len(on_surface), size=len(chosen) * settings.random_points)]
+    parts["random_points"] = [near + _JITTER * rng.standard_normal(near.shape)]
     tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v).T, dtype=np.float32)) for k, v in parts.items()}
-    return ShapeBatch(mi.TensorXf(one_hot), len(chosen), **tensor)
+    mixture = mi.TensorXf(gaussian_mixture(len(chosen), rng))
+    return ShapeBatch(mi.TensorXf(one_hot), len(chosen), mixture=mixture, **tensor)
+
+
+def gaussian_mixture(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Weights [count, count] whose columns take vectors z_k to samples of their Gaussian: Z @ weights has their mean
+    and, over many draws, their covariance (with 1 / count)."""
+    noise = rng.standard_normal((count, count)) / np.sqrt(count)
+    return (noise - noise.mean(axis=0) + 1 / count).astype(np.float32)
 
 
 def _columns_of(tensor, scenes: int, first: int, last: int):
@@ -112,11 +133,9 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
     """Every term of eq. 7 and the two on scan normals and distances, unweighted, by the names of `ShapeTraining`."""
     z_sdf, z_r = (parameters[name] @ batch.scenes for name in LATENTS)
     networks = architecture.networks
-    field = SdfField(
-        layers(networks["deformation"], parameters["deformation"], z_sdf),
-        layers(networks["reference"], parameters["reference"]),
-        architecture.sdf_octaves,
-    )
+    decoders = parameters["deformation"], parameters["reference"]
+    field = signed_distance_field(architecture, *decoders, z_sdf)
+    random_heads = signed_distance_field(architecture, *decoders, dr.detach(z_sdf) @ batch.mixture)
     n = batch.normals.shape[1] // batch.count
     width = batch.points.shape[1] // batch.count
     everywhere = surface(field, batch.points)
@@ -131,6 +150,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         "normal": losses.normal_loss(gradient, batch.normals),
         "distance": losses.distance_loss(f_volume, batch.volume_distance),
         "eikonal": losses.eikonal_loss(everywhere[1]),
+        "random_eikonal": losses.eikonal_loss(surface(random_heads, batch.random_points)[1]),
         "deformation": losses.deformation_loss(x_ref - points, batch.count),
         "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
         "color": losses.photometric_loss(radiance, batch.colors),
@@ -143,13 +163,29 @@ def weighted_sum(terms: dict, settings: ShapeTraining):
     return sum((getattr(settings, name) * value for name, value in terms.items()), mi.TensorXf([0.0]))
 
 
+def all_steps(settings: ShapeTraining) -> int:
+    """Number of steps, the finishing ones included."""
+    return settings.steps + round(settings.finishing * settings.steps)
+
+
 def rates(settings: ShapeTraining, step: int) -> dict[str, float]:
     """Learning rate of every parameter at `step`."""
-    fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
+    first, length, height = 0, settings.steps, 1.0
+    if step >= settings.steps:
+        first, length, height = settings.steps, all_steps(settings) - settings.steps, settings.finishing_rate
+    fall = height * (0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * (step - first) / max(length, 1))))
     return {
         **dict.fromkeys(NETWORKS, settings.learning_rate * fall),
         **dict.fromkeys(LATENTS, settings.latent_rate * fall),
     }
+
+
+def weights_at(settings: ShapeTraining, step: int) -> ShapeTraining:
+    """The settings with the weights of `step`."""
+    if step < settings.steps:
+        return settings
+    factor = settings.finishing_eikonal
+    return replace(settings, eikonal=factor * settings.eikonal, random_eikonal=factor * settings.random_eikonal)
 
 
 def training_step(architecture, settings: ShapeTraining, optimizer, batch: ShapeBatch) -> dict[str, float]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField
-from sira_mi.models.avatar import Avatar, AvatarArchitecture
+from sira_mi.models.avatar import Avatar, AvatarArchitecture, signed_distance_field
 from sira_mi.models.prior import NETWORKS_OF_SHAPE as NETWORKS
 from sira_mi.models.prior import whitening
 
@@ -65,6 +65,5 @@ class ShapeModel:
         """The signed distance field of shape latents: a tensor [dim, S], or one NumPy vector [dim]."""
         if isinstance(latent, np.ndarray):
             latent = mi.TensorXf(np.ascontiguousarray(latent[:, None], np.float32))
-        return SdfField(
-            self.layers_at("deformation", latent), self.layers_at("reference"), self.architecture.sdf_octaves
-        )
+        decoders = mi.Float(self.networks["deformation"]), mi.Float(self.networks["reference"])
+        return signed_distance_field(self.architecture, *decoders, latent)
