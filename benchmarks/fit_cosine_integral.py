@@ -1,28 +1,32 @@
-"""Fits the two polynomials of `sira_mi/sg/integrals.py` to quadrature: `python benchmarks/fit_cosine_integral.py`.
+"""Fits the three polynomials of `sira_mi/sg/integrals.py` to quadrature: `python benchmarks/fit_cosine_integral.py`.
 
-Prints `_COSINE_DEVIATION` and `_STEP_RATIO` as source, and the errors of the two forms in float64. With `--check` it
-compares them with the constants of the package and ends with 1 if they differ by more than the tolerance below.
+Prints `_COSINE_DEVIATION`, `_STEP_RATIO` and `_TAIL` as source, and the errors of the forms in float64. With `--check`
+it compares them with the constants of the package and ends with 1 if they differ by more than the tolerances below.
 
-Both are even polynomials in the cosine c = ξ·n with coefficients in y = λ/(λ + k), fitted by iteratively reweighted
-least squares: a point's weight grows with its error, which brings the largest error down.
+The first two are even polynomials in the cosine c = ξ·n with coefficients in y = λ/(λ + k). All are fitted by
+iteratively reweighted least squares: a point's weight grows with its error, which brings the largest error down.
 
 - `_COSINE_DEVIATION` is s²/v of `cosine_integral`, v the lobe's variance across its axis. The value that makes the form
   exact is found by Newton's method; the error that counts is divided by 98% of the integral plus 2% of that at ξ = n.
 - `_STEP_RATIO` is t of `hemisphere_integral` over its slope. The error that counts is absolute.
+- `_TAIL` is (1 − t M(t)) / y² with Mills' ratio M and y = 1/(1 + 0.35 t), a polynomial in y. The error that counts is
+  relative.
 """
 
 import argparse
 import sys
 
 import numpy as np
-from scipy.special import i0e, ndtr, ndtri
+from scipy.special import erfcx, i0e, ndtr, ndtri
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(600)
 COSINE_TERMS, COSINE_HALF_POINT, COSINE_FLOOR, COSINE_ITERATIONS = (6, 3), 3.0, 0.02, 200
 STEP_TERMS, STEP_HALF_POINT, STEP_ITERATIONS = (6, 4), 4.0, 30
+TAIL_TERMS, TAIL_SCALE, TAIL_END, TAIL_ITERATIONS = 9, 0.35, 40.0, 60
 # Largest difference of a recomputed polynomial from the package's, whose coefficients have seven digits, over
 # 0 <= c <= 1 and 0 <= y < 1, where both are about 1. Single coefficients may differ more, by their conditioning.
 TOLERANCE = 1e-4
+TAIL_TOLERANCE = 1e-6
 
 
 def hemisphere_quadrature(sharpness: float, cosine: float, power: int) -> float:
@@ -138,6 +142,29 @@ def fit_step(sharpness, cosine, step) -> tuple[np.ndarray, float]:
     return solution.reshape(STEP_TERMS).T, error.max()
 
 
+def tail(distance: np.ndarray) -> np.ndarray:
+    """1 − t M(t): from t = 3 by the continued fraction of M, which does not cancel."""
+    fraction = distance.copy()
+    for k in range(400, 1, -1):
+        fraction = distance + k / fraction
+    mills = np.sqrt(np.pi / 2.0) * erfcx(distance / np.sqrt(2.0))
+    return np.where(distance < 3.0, 1.0 - distance * mills, 1.0 / (fraction * distance + 1.0))
+
+
+def fit_tail() -> tuple[np.ndarray, float]:
+    """Coefficients [9] of `_TAIL` and the largest relative error for 0 <= t <= 40."""
+    y = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4000) + 0.5) / 4000)
+    y = y[y > 1.0 / (1.0 + TAIL_SCALE * TAIL_END)]
+    matrix = np.vander(y, TAIL_TERMS, increasing=True) * (y**2 / tail((1.0 / y - 1.0) / TAIL_SCALE))[:, None]
+    weight = np.ones_like(y)
+    for _ in range(TAIL_ITERATIONS):
+        solution = weighted_solution(matrix, np.ones_like(y), weight)
+        error = np.abs(matrix @ solution - 1.0)
+        weight *= np.sqrt(error / error.max() + 1e-3)
+        weight /= weight.max()
+    return solution, error.max()
+
+
 def source(name: str, rows: np.ndarray) -> str:
     """Python source of a table [n_j, n_i]."""
     lines = ("    (" + ", ".join(f"{x:.7g}" for x in row) + "),\n" for row in rows)
@@ -162,11 +189,14 @@ def main() -> None:
     sharpness, cosine, clamped, step, peak = samples()
     deviation, cosine_error = fit_cosine(sharpness, cosine, clamped, peak)
     ratio, step_error = fit_step(sharpness, cosine, step)
+    tail_coefficients, tail_error = fit_tail()
     if not arguments.check:
         print(f"# largest error relative to the value at ξ = n: {cosine_error:.2e}")
         print(source("_COSINE_DEVIATION", deviation))
         print(f"# largest error relative to the whole lobe: {step_error:.2e}")
         print(source("_STEP_RATIO", ratio))
+        print(f"# largest relative error: {tail_error:.2e}")
+        print(f"_TAIL = ({', '.join(f'{x:.7g}' for x in tail_coefficients)})")
         return
     from sira_mi.sg import integrals
 
@@ -175,7 +205,11 @@ def main() -> None:
         difference("_STEP_RATIO", ratio, integrals._STEP_RATIO, integrals._STEP_HALF_POINT),
     )
     print(f"tolerance {TOLERANCE:.0e} of the polynomials")
-    sys.exit(int(not largest <= TOLERANCE))
+    y = np.linspace(1.0 / (1.0 + TAIL_SCALE * TAIL_END), 1.0, 401)
+    powers = np.vander(y, TAIL_TERMS, increasing=True)
+    tail_difference = np.abs(powers @ integrals._TAIL / (powers @ tail_coefficients) - 1.0).max()
+    print(f"_TAIL: largest relative difference {tail_difference:.1e}, tolerance {TAIL_TOLERANCE:.0e}")
+    sys.exit(int(not (largest <= TOLERANCE and tail_difference <= TAIL_TOLERANCE)))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ class SiraBSDF(mi.BSDF):
 
      * - roughness
        - |float|
-       - r, from 0.05 to 1. (Default: 0.5)
+       - r, from 0.02 to 1. (Default: 0.5)
        - |exposed|, |differentiable|
 
      * - k_s
@@ -61,7 +61,7 @@ class SiraBSDF(mi.BSDF):
         self.specular_albedo = self._texture(props, "specular_albedo")
         roughness, k_s = float(props.get("roughness", 0.5)), float(props.get("k_s", 1.0))
         if not brdf.MINIMUM_ROUGHNESS <= roughness <= brdf.MAXIMUM_ROUGHNESS:
-            raise InputError(f"sira_bsdf: roughness is {roughness}; it must be 0.05 to 1")
+            raise InputError(f"sira_bsdf: roughness is {roughness}; it must be 0.02 to 1")
         if not 0.0 <= k_s < float("inf"):
             raise InputError(f"sira_bsdf: k_s is {k_s}; it must be finite and not negative")
         self.roughness, self.k_s = mi.Float(roughness), mi.Float(k_s)

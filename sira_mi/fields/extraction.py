@@ -14,7 +14,7 @@ from skimage.measure import marching_cubes
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 
 # A cell is refined when |f| at its nearest evaluated corner is below this many cell diagonals; 1 would suffice for an
-# exact distance, the margin allows for |∇f| up to 1.6.
+# exact distance, the margin allows for |∇f| up to 1.6. Fields that are steeper as a whole are refined farther out.
 _MARGIN = 1.6
 _LEVELS = 3
 
@@ -62,8 +62,9 @@ def extract(evaluate: Callable[[np.ndarray], np.ndarray], voxel: float) -> Extra
     spacing = voxel * 2**_LEVELS
     shape = _shape(spacing)
     values = evaluate(_points(_axes(shape, spacing), np.arange(np.prod(shape)))).reshape(shape)
+    margin = _MARGIN * max(1.0, _typical_slope(values, spacing))
     for _ in range(_LEVELS):
-        values, spacing = _refine(evaluate, values, spacing)
+        values, spacing = _refine(evaluate, values, spacing, margin)
     nx, ny, nz = _shape(voxel)
     return _mesh(values[:nx, :ny, :nz], voxel)
 
@@ -75,8 +76,14 @@ def extract_reference(evaluate: Callable[[np.ndarray], np.ndarray], voxel: float
     return _mesh(values, voxel)
 
 
-def _refine(evaluate, values: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:
-    """Halves the spacing: evaluates points near the surface, interpolates the others linearly."""
+def _typical_slope(values: np.ndarray, spacing: float) -> float:
+    """Median length of the gradient on a grid."""
+    return float(np.median(np.linalg.norm(np.gradient(values, spacing), axis=0)))
+
+
+def _refine(evaluate, values: np.ndarray, spacing: float, margin: float) -> tuple[np.ndarray, float]:
+    """Halves the spacing: evaluates points within `margin` cell diagonals of the surface, interpolates the others
+    linearly."""
     fine = values
     for axis in range(3):
         fine = np.moveaxis(fine, axis, 0)
@@ -86,7 +93,7 @@ def _refine(evaluate, values: np.ndarray, spacing: float) -> tuple[np.ndarray, f
         fine = np.moveaxis(woven, 0, axis)
     new = np.ones(fine.shape, bool)
     new[::2, ::2, ::2] = False
-    near = np.flatnonzero((new & (np.abs(fine) < _MARGIN * spacing * np.sqrt(3))).ravel())
+    near = np.flatnonzero((new & (np.abs(fine) < margin * spacing * np.sqrt(3))).ravel())
     spacing /= 2
     axes = _axes(fine.shape, spacing)
     fine = np.ascontiguousarray(fine)

@@ -5,22 +5,28 @@ Rays start from a proxy (a mesh hit or a distance grid), so that the field itsel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER
-from sira_mi.fields.sdf import SdfField, in_three, signed_distance, signed_distance_and_slope
+from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, in_three, signed_distance, signed_distance_and_slope
 
-# A hit counts as exact when |f| is below this many scene units (IDR's 5e-5 of a unit sphere).
-HIT_TOLERANCE = 1e-4
+# A hit counts as exact when |f| is below this many scene units: within 0.01 mm of the surface where the gradient has a
+# fifth of its typical length or more.
+HIT_TOLERANCE = 1.5e-5
 _MAXIMUM_STEP = 0.15
 _MINIMUM_SLOPE = 0.02
 # The search of `first_crossings`, in scene units along the ray from the proxy's hit.
 _SEARCH_START, _SEARCH_STEP, _SEARCH_SAMPLES = -0.24, 0.03, 64
 _NO_CROSSING = 1e9
+# Where rays without a crossing are evaluated, scene units.
+_FAR = 1e4
+_ITERATIONS = 4
+# Evaluations of the field that a ray takes in `refined_hits`; three of them carry the slope along.
+MAXIMUM_EVALUATIONS = 3 * (1 + _ITERATIONS) + _SEARCH_SAMPLES
 
 
 def on_ray(origin, direction, t):
@@ -29,7 +35,7 @@ def on_ray(origin, direction, t):
     return origin + in_three(t) * direction
 
 
-def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
+def newton_hits(field: SdfField, origin, direction, t, iterations: int = _ITERATIONS):
     """Moves ray parameters t [1, N] onto the field's surface: Newton steps along the ray whose slope ∇f·v is taken
     once, at the start, then improved by secants. `origin` and `direction` are [3, N].
 
@@ -40,7 +46,7 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = 4):
         for _ in range(iterations):
             safe = dr.select(dr.abs(slope) < _MINIMUM_SLOPE, dr.copysign(_MINIMUM_SLOPE, slope), slope)
             step = dr.minimum(dr.maximum(-f / safe, -_MAXIMUM_STEP), _MAXIMUM_STEP)
-            step = dr.select(dr.abs(f) < 0.1 * HIT_TOLERANCE, 0.0, step)
+            step = dr.select(dr.abs(f) < 0.5 * HIT_TOLERANCE, 0.0, step)
             t_new = t + step
             f_new = signed_distance(field, on_ray(origin, direction, t_new))
             secant = (f_new - f) / dr.select(step == 0.0, 1.0, step)
@@ -67,6 +73,33 @@ def first_crossings(field: SdfField, origin, direction, t):
             before = f
             dr.eval(found, before)
         return found
+
+
+def with_unit_gradient(field: SdfField, length: float) -> SdfField:
+    """The field divided by `length`, its gradient's typical length at the surface: |f| becomes a distance."""
+    weight, bias = field.reference[-1]
+    return replace(field, reference=[*field.reference[:-1], (weight / length, bias / length)])
+
+
+def refined_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
+    """The surface near the parameters t [1, N] of rays [3, N]: Newton steps; for rays that are not on it yet as many
+    again, as thin features need; for those still off it Newton steps from their first crossing near t. Returns t and f
+    [1, N] like `newton_hits`; a ray takes at most `MAXIMUM_EVALUATIONS`."""
+
+    def newton(*columns):
+        return evaluate_in_chunks(lambda o, d, t: newton_hits(field, o, d, t), *columns)
+
+    result = newton(origin, direction, t)
+    for search in (False, True):
+        stray = np.flatnonzero(~(np.abs(result[1][0]) < HIT_TOLERANCE))
+        if not len(stray):
+            break
+        o, d, start = (c[:, stray] for c in (origin, direction, t if search else result[0]))
+        if search:
+            (start,) = evaluate_in_chunks(lambda o, d, t: first_crossings(field, o, d, t), o, d, start)
+        for whole, part in zip(result, newton(o, d, np.minimum(start, _FAR)), strict=True):
+            whole[:, stray] = part
+    return result
 
 
 def bisection_hits_reference(field: SdfField, origin, direction, t_outside, t_inside, iterations: int = 40):

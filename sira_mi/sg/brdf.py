@@ -10,7 +10,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-MINIMUM_ROUGHNESS = 0.05
+MINIMUM_ROUGHNESS = 0.02
 MAXIMUM_ROUGHNESS = 1.0
 
 
@@ -67,7 +67,7 @@ def sample_distribution(sample: "mi.Point2f", roughness: "mi.Float") -> "mi.Vect
     """A half vector around +z with the density D(h) over the sphere, from two uniform numbers."""
     sharpness = distribution_sharpness(roughness)
     # D is normalised up to exp(−2λ) <= e⁻⁴; the cosine's distribution is truncated to the sphere exactly.
-    gap = -dr.log(1.0 - sample.x * (1.0 - dr.exp(-2.0 * sharpness))) / sharpness
+    gap = -dr.log(dr.fma(sample.x, dr.exp(-2.0 * sharpness), 1.0 - sample.x)) / sharpness
     sine = dr.safe_sqrt(gap * (2.0 - gap))
     sin_phi, cos_phi = dr.sincos(2.0 * math.pi * sample.y)
     return mi.Vector3f(sine * cos_phi, sine * sin_phi, 1.0 - gap)

@@ -1,4 +1,4 @@
-"""Integrals of spherical Gaussians in closed form, stable in single precision for sharpness from 1e-3 to 1e5.
+"""Integrals of spherical Gaussians in closed form, stable in single precision for sharpness from 0 to 1e7.
 
 Exact: the integral over the sphere, the product of two lobes (again a lobe) and their inner product. The integrals over
 a hemisphere, plain and cosine-weighted, have no elementary form. Here they are those of a normal distribution: for a
@@ -33,9 +33,15 @@ _STEP_RATIO = (
     (-0.2743178, 3.582271, -14.78511, 26.18992, -21.4145, 6.65747),
     (0.06185335, 0.07184525, -6.019213, 26.24983, -36.93142, 17.14946),
 )
+# E max(N(0, 1) − t, 0) for t >= 0 over the normal density at t: y² Σ c_i y^i with y = 1/(1 + t _TAIL_SCALE), relative
+# error 5e-7. The difference of the two terms of the definition loses all its digits in single precision.
+_TAIL_SCALE = 0.35
+_TAIL = (0.1224904, 0.2453933, 0.31606, 0.3646339, -0.0792073, 0.7903021, -1.513293, 0.9744817, -0.2208612)
 # Below these sharpnesses the quotients are evaluated by their Taylor series.
 _SERIES_INTEGRAL = 0.3
 _SERIES_MEAN = 0.7
+# Keeps the product of two constant lobes free of 0/0.
+_SMALLEST_SHARPNESS = 1e-12
 
 
 def _polynomial(x, coefficients):
@@ -56,8 +62,11 @@ def _normal_density(x):
     return dr.exp(-0.5 * dr.square(x)) * (1.0 / math.sqrt(2.0 * math.pi))
 
 
-def _normal_cumulative(x):
-    return 0.5 + 0.5 * dr.erf(x * math.sqrt(0.5))
+def _clamped_mean(x):
+    """E max(x + N(0, 1), 0) = x Φ(x) + φ(x), to a relative error of 1e-6 for every x."""
+    distance = dr.abs(x)
+    y = dr.rcp(dr.fma(distance, _TAIL_SCALE, 1.0))
+    return dr.maximum(x, 0.0) + _normal_density(distance) * dr.square(y) * _polynomial(y, _TAIL)
 
 
 def _logistic_cumulative(x):
@@ -91,10 +100,19 @@ def product(
     λ_m = |λ_a ξ_a + λ_b ξ_b|, and the log is −λ_a λ_b |ξ_a − ξ_b|² / (λ_m + λ_a + λ_b): no cancellation."""
     total = sharpness_a + sharpness_b
     gap = dr.squared_norm(axis_a - axis_b)
-    # λ_m² = (λ_a + λ_b)² − λ_a λ_b |ξ_a − ξ_b|² vanishes only for equal, opposite lobes.
-    vector = sharpness_a * axis_a + sharpness_b * axis_b
-    sharpness = dr.sqrt(dr.squared_norm(vector) + dr.square(1e-6 * total))
-    return vector / sharpness, sharpness, -sharpness_a * sharpness_b * gap / (sharpness + total)
+    # The mean of the axes in two roundings, from the sharper lobe's: sharp products need all digits of their axis. Its
+    # length λ_m / (λ_a + λ_b) vanishes only for equal, opposite lobes.
+    a_is_sharper = sharpness_a >= sharpness_b
+    sharper, other = dr.select(a_is_sharper, axis_a, axis_b), dr.select(a_is_sharper, axis_b, axis_a)
+    share = dr.minimum(sharpness_a, sharpness_b) / dr.maximum(total, _SMALLEST_SHARPNESS)
+    mean = dr.fma(other - sharper, share, sharper)
+    length = dr.sqrt(dr.squared_norm(mean) + 1e-12)
+    sharpness = total * length
+    log_amplitude = -sharpness_a * sharpness_b * gap / dr.maximum(sharpness + total, _SMALLEST_SHARPNESS)
+    # A length within 1e-6 of 1 is left as it is: its own derivative counts, its rounding would turn the axis.
+    excess = (1.0 - length) / length
+    excess -= dr.detach(dr.select(dr.abs(excess) < 1e-6, excess, 0.0))
+    return dr.fma(mean, excess, mean), sharpness, log_amplitude
 
 
 def inner_product(
@@ -119,6 +137,4 @@ def cosine_integral(cosine: "mi.Float", sharpness: "mi.Float") -> "mi.Float":
     mean = variance * sharpness * cosine
     ratio = _even_polynomial(cosine, sharpness, _COSINE_HALF_POINT, _COSINE_DEVIATION)
     deviation = dr.sqrt(variance * ratio)
-    x = mean / deviation
-    clamped = mean * _normal_cumulative(x) + deviation * _normal_density(x)
-    return sphere_integral(sharpness) * dr.maximum(clamped, 0.0)
+    return sphere_integral(sharpness) * deviation * _clamped_mean(mean / deviation)
