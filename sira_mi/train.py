@@ -126,9 +126,11 @@ def train_shape(
     picture_steps: int = 1000,
     scenes: list | None = None,
 ) -> dict[str, np.ndarray]:
-    """Trains the SA-SM; returns its networks and latents [dim, scenes]. A field without deformation has no reference
-    space for albedos: `out/prior.safetensors` is written at once then, with untrained appearance. `without` names a loss term to leave out,
-    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
+    """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
+    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already.
+
+    A field without deformation has no reference space for albedos: `out/prior.safetensors` is written at once then,
+    with untrained appearance."""
     from sira_mi.models import sa_sm
     from sira_mi.models.af_sm import initial_appearance_model
     from sira_mi.models.avatar import save_avatar

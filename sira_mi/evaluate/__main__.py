@@ -1,8 +1,9 @@
-"""`python -m sira_mi.evaluate prior|sizes --collection DIR --runs DIR`: measures the priors and writes their page.
+"""`python -m sira_mi.evaluate prior|sizes|benchmark --collection DIR …`: measures the priors, builds the benchmark.
 
 `prior` measures the prior of a run on the collection's test split, trains and measures the ablations, and writes
 `docs/priors.md` and its pictures; `sizes` trains and measures networks of several sizes for a table on that page.
-Results are kept in RUNS/evidence, so that only what has changed is measured again.
+Results are kept in RUNS/evidence, so that only what has changed is measured again. `benchmark` photographs test heads
+of the collection under known light; portraits that are there already are kept.
 """
 
 import argparse
@@ -25,7 +26,35 @@ def main() -> None:
         command.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
         command.add_argument(option, type=int, default=steps, metavar="N", dest="steps", help="of every short training")
         command.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    portraits = commands.add_parser("benchmark", help="build or resume the benchmark of portraits")
+    portraits.add_argument("--collection", type=Path, required=True, help="folder whose test heads are photographed")
+    portraits.add_argument("--out", type=Path, required=True, help="folder of the benchmark")
+    portraits.add_argument("--hair", type=Path, help="folder of hair that the collection was built with")
+    portraits.add_argument("--ict", type=Path, help="file of ICT-FaceKit that the collection was built with")
+    portraits.add_argument("--valid", type=Path, help="folder of VALID avatars that the collection was built with")
+    portraits.add_argument("--meshes", type=Path, help="folder of meshes that the collection was built with")
+    portraits.add_argument("--hdri", type=Path, help="folder of .exr maps for the outdoor lights; else sun and sky")
+    portraits.add_argument("--sources", nargs="+", metavar="NAME", help="use these sources only, of the collection's")
+    portraits.add_argument("--primary", action="store_true", help="one light of each head instead of three")
+    portraits.add_argument("--workers", type=int, default=1, help="processes")
+    fits = commands.add_parser("fits", help="fit the benchmark's portraits, score them, write the page")
+    fits.add_argument("--benchmark", type=Path, required=True)
+    fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
+    fits.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
+    fits.add_argument("--quality", choices=("draft", "standard", "high"), default="standard")
+    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods (default: all, a.1 to b.3)")
+    fits.add_argument(
+        "--portraits", nargs="+", default=(), metavar="NAME", help="portraits (default: the primary ones)"
+    )
+    fits.add_argument("--all-lights", action="store_true", help="every portrait, not one of each head")
+    fits.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
+    fits.add_argument("--prior-without-deformation", type=Path, metavar="PRIOR", help="for the methods a.1 and a.2")
+    fits.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     arguments = parser.parse_args()
+    if arguments.command == "benchmark":
+        return make_benchmark(arguments)
+    if arguments.command == "fits":
+        return compare_fits(arguments)
     if arguments.steps < 0:
         raise InputError("a number of steps is 0 (train nothing) or more")
     mi.set_variant(arguments.variant)
@@ -47,6 +76,51 @@ def main() -> None:
         run_sizes(arguments.collection, evidence, arguments.steps)
     page = write_page(evidence, arguments.out)
     print(f"{page} written after {time.monotonic() - start:.0f} s")
+
+
+def compare_fits(arguments: argparse.Namespace) -> None:
+    """Fits and scores the benchmark's portraits as the command line says, and writes the page."""
+    mi.set_variant(arguments.variant)
+    from sira_mi.evaluate.fits import Comparison, compare, write_rows
+    from sira_mi.evaluate.methods import BY_NAME
+    from sira_mi.evaluate.results_page import write_results
+    from sira_mi.models.avatar import PRIOR
+
+    comparison = Comparison(
+        arguments.benchmark,
+        arguments.runs,
+        arguments.quality,
+        tuple(arguments.methods or BY_NAME),
+        arguments.prior or PRIOR,
+        arguments.prior_without_deformation,
+        primary=not arguments.all_lights,
+        only=tuple(arguments.portraits),
+        variant=arguments.variant,
+    )
+    rows = compare(comparison)
+    write_rows(arguments.runs / "rows.json", rows)
+    page = write_results(rows, arguments.benchmark, arguments.runs, arguments.out, arguments.quality)
+    print(f"{page} written")
+
+
+def make_benchmark(arguments: argparse.Namespace) -> None:
+    """Builds the benchmark that the command line describes and prints what it holds."""
+    from sira_mi.evaluate.benchmark import build_benchmark
+    from sira_mi.evaluate.benchmark_plan import BenchmarkSettings, named_sources
+
+    if arguments.workers < 1:
+        raise InputError("--workers must be at least 1")
+    data = {name: getattr(arguments, name) for name in ("hair", "ict", "valid", "meshes")}
+    sources = named_sources(arguments.collection, arguments.sources, data)
+    start = time.monotonic()
+    settings = BenchmarkSettings(primary_only=arguments.primary)
+    entries = build_benchmark(arguments.collection, arguments.out, sources, arguments.hdri, arguments.workers, settings)
+    heads = len({entry["identity"] for entry in entries})
+    hair = len({entry["identity"] for entry in entries if entry["hair"]})
+    print(
+        f"{arguments.out}: {len(entries)} portraits of {heads} heads, {hair} of them with hair, "
+        f"after {time.monotonic() - start:.0f} s"
+    )
 
 
 if __name__ == "__main__":

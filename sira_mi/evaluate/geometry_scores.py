@@ -39,6 +39,7 @@ from sira_mi.evaluate.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statisti
 from sira_mi.evaluate.surface_distance import TriangleTree
 from sira_mi.evaluate.truth import LANDMARKS, Truth, check_array, check_mesh
 from sira_mi.evaluate.visible_surface import MeshImages, OuterSurface, mesh_images, outer_surface, seen_by_camera
+from sira_mi.fit.rays import modelled_pixels
 from sira_mi.portrait.camera import Camera
 
 ALIGNMENTS = ("h3ds", "landmarks", "camera", "camera_raw")
@@ -126,7 +127,8 @@ def score_geometry(
     counts the points measured (the others are NaN when there are none); `ALIGNMENT_REGION_mean`, the mean of both
     directions' means; `ALIGNMENT_scale` and `ALIGNMENT_turn` (degrees), of the map from prediction to truth, for the
     cameras from camera to camera; `landmarks_used` of six and their root mean square distance `landmarks_rms`; and
-    the scores of `score_normals` and `silhouette_iou`. Raises InputError for a prediction that cannot be measured."""
+    the scores of `score_normals` and `silhouette_iou`, the latter where a head model can be: over the pixels of
+    `fit.rays.modelled_pixels`. Raises InputError for a prediction that cannot be measured."""
     settings = settings or GeometrySettings()
     prediction.check(truth.camera.height, truth.camera.width)
     surface = surface or true_surface(truth, settings)
@@ -166,7 +168,8 @@ def score_geometry(
     normal = images.normal if prediction.normal is None else prediction.normal
     mask = images.mask if prediction.mask is None else prediction.mask
     scores |= score_normals(normal, mask, prediction.camera, truth, surface)
-    scores["silhouette_iou"] = silhouette_iou(mask, truth.mask)
+    modelled = modelled_pixels(truth.camera)
+    scores["silhouette_iou"] = silhouette_iou(np.where(modelled, mask, 0), np.where(modelled, truth.mask, 0))
     return scores
 
 

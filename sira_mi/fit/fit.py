@@ -7,6 +7,7 @@ import resource
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +22,7 @@ from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.rays import modelled_pixels
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, FitSettings
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, RELIEF, FitSettings, without
 from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
@@ -59,6 +60,8 @@ def fit_photo(request: FitRequest) -> int:
     started = time.monotonic()
     set_variant(request.variant)
     settings = QUALITIES[request.quality]
+    if request.camera is not None:
+        settings = without(settings, "pose")
     prior_path = request.prior or PRIOR
     prior = load_avatar(prior_path)
     portrait = read_portrait(request, settings, prior)
@@ -75,11 +78,17 @@ def fit_photo(request: FitRequest) -> int:
     else:
         progress = Progress(initial_tensors(prior, request.seed))
 
-    problems = stage_problems(portrait, prior, prior_path, work, settings)
-    stages = [(problems[kind], stage) for kind, stage in settings.stages]
     interrupted = False
     try:
-        run_stages(stages, progress, settings.block, request.seed, lambda p: save_progress(checkpoint, p, identity))
+        fit_portrait(
+            portrait,
+            prior_path,
+            settings,
+            request.seed,
+            work,
+            progress,
+            lambda p: save_progress(checkpoint, p, identity),
+        )
     except KeyboardInterrupt:
         interrupted = True
         print("interrupted: writing what there is; --resume goes on from the last checkpoint", file=sys.stderr)
@@ -95,12 +104,27 @@ def fit_photo(request: FitRequest) -> int:
         "notes": list(portrait.notes),
         "versions": {"sira_mi": sira_mi.__version__, **{p: version(p) for p in ("mitsuba", "drjit", "numpy")}},
     }
-    write_folder(request.out, portrait, avatar, settings, report, started)
+    write_folder(request.out, with_pose(portrait, progress.tensors), avatar, settings, report, started)
     if not interrupted:
         for file in work.iterdir():
             file.unlink()
         work.rmdir()
     return 130 if interrupted else 0
+
+
+def fit_portrait(
+    portrait: Portrait,
+    prior_path: Path,
+    settings: FitSettings,
+    seed: int,
+    work: Path,
+    progress: Progress,
+    checkpoint: Callable[[Progress], None] = lambda progress: None,
+) -> None:
+    """Runs the stages of `settings` from where `progress` stands, which follows; `work` is a folder for files in
+    between. Raises InputError when the fit diverges."""
+    problems = stage_problems(portrait, load_avatar(prior_path), prior_path, work, settings)
+    run_stages([(problems[kind], stage) for kind, stage in settings.stages], progress, settings.block, seed, checkpoint)
 
 
 def set_variant(variant: str) -> None:
@@ -168,38 +192,54 @@ def initial_tensors(prior: Avatar, seed: int) -> dict[str, np.ndarray]:
     for name in ("z_sdf", "z_r", "z_a", "z_s"):
         tensors[name] = (tensors[name] + 0.01 * rng.standard_normal(tensors[name].shape)).astype(np.float32)
     del tensors["landmarks"]
+    tensors["pose"] = np.zeros(6, np.float32)
     return tensors
 
 
+def with_pose(portrait: Portrait, tensors: dict[str, np.ndarray]) -> Portrait:
+    """The portrait whose camera sees the unmoved head as the fit's `pose` has it."""
+    from sira_mi.fit.geometry import moved_camera
+
+    return replace(portrait, camera=moved_camera(portrait.camera, tensors["pose"]))
+
+
 def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settings: FitSettings) -> dict:
-    """Per kind of stage a function from the current tensors to the stage's problem; a problem is made once and serves
-    the stages that follow each other."""
+    """Per kind of stage a function from the current tensors to the stage's problem. A problem is made from the geometry
+    at hand when the kind changes, and serves the stages of its kind that follow each other."""
     from sira_mi.fit.appearance import AppearanceProblem
     from sira_mi.fit.geometry import GeometryProblem
+    from sira_mi.fit.relief import ReliefProblem
 
     made: dict[str, object] = {}
 
-    def geometry(tensors):
-        if GEOMETRY not in made:
-            made[GEOMETRY] = GeometryProblem(portrait, prior, str(prior_path), settings)
-        return made[GEOMETRY]
+    def of_kind(kind: str, make: Callable[[dict], object]) -> Callable[[dict], object]:
+        def problem(tensors):
+            if kind not in made:
+                made.clear()
+                made[kind] = make(tensors)
+            return made[kind]
 
-    def appearance(tensors):
-        if APPEARANCE not in made:
-            made.clear()
-            current = prior.replaced(**{k: v for k, v in tensors.items() if k in prior.tensors})
+        return problem
+
+    def on_fitted(problem: type) -> Callable[[dict], object]:
+        def make(tensors):
             path = work / "geometry.safetensors"
-            save_avatar(path, current)
-            made[APPEARANCE] = AppearanceProblem(portrait, prior, str(path), settings)
-        return made[APPEARANCE]
+            save_avatar(path, prior.replaced(**{k: v for k, v in tensors.items() if k in prior.tensors}))
+            return problem(with_pose(portrait, tensors), prior, str(path), settings)
 
-    return {GEOMETRY: geometry, APPEARANCE: appearance}
+        return make
+
+    return {
+        GEOMETRY: of_kind(GEOMETRY, lambda tensors: GeometryProblem(portrait, prior, str(prior_path), settings)),
+        APPEARANCE: of_kind(APPEARANCE, on_fitted(AppearanceProblem)),
+        RELIEF: of_kind(RELIEF, on_fitted(ReliefProblem)),
+    }
 
 
 def finished_avatar(prior: Avatar, progress: Progress, settings: FitSettings) -> Avatar:
     """The avatar at the fit's last parameters, its light decoded to lobes; k_s and k_r are those of the stages that
     were reached."""
-    from sira_mi.fit.appearance import decode_lobes
+    from sira_mi.fit.shaded import decode_lobes
 
     tensors = {k: v for k, v in progress.tensors.items() if k in prior.tensors}
     floats = {k: mi.Float(tensors[k]) for k in ("illumination", "z_l")}

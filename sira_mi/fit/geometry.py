@@ -1,8 +1,10 @@
 """The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF
-stays as it is.
+stays as it is. The head's pose, estimated from landmarks of the mean head, is optimised along.
 
 Colour and mask losses go through the `sira_radiance` integrator by `mi.render`; eikonal, landmark and regularising
 terms are evaluated on the field."""
+
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,12 +13,11 @@ import numpy as np
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
-from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, surface
+from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, rigid_motion, surface
 from sira_mi.fit.rays import modelled_pixels, window_around, window_camera, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.models import losses
-from sira_mi.models.avatar import Avatar
+from sira_mi.models.avatar import Avatar, signed_distance_field
 from sira_mi.portrait.camera import Camera, landmark_weights
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.scene import principal_point_offset, sensor
@@ -24,8 +25,10 @@ from sira_mi.scene import principal_point_offset, sensor
 _PARAMETERS = {
     "z_sdf": "head.z_sdf",
     "deformation": "head.deformation",
+    "reference": "head.reference",
     "z_r": "integrator.z_r",
     "rendering": "integrator.rendering",
+    "pose": "head.pose",
 }
 # Fixed-point steps that find a landmark's place from its place in reference space.
 _LANDMARK_STEPS = 4
@@ -65,34 +68,28 @@ class GeometryProblem:
             "type": "scene",
             "sensor": sensor(camera, pixel_centres),
             "integrator": {"type": "sira_radiance", "avatar": avatar_path},
-            "head": {"type": "neural_sdf", "avatar": avatar_path, "voxel": self.settings.voxel},
+            "head": {"type": "neural_sdf", "avatar": avatar_path, "voxel": self.settings.voxel, "movable": True},
         }
 
     def _field(self, tensors: dict) -> SdfField:
-        networks = self.avatar.architecture.networks
         z_sdf = mi.TensorXf(tensors["z_sdf"], (len(tensors["z_sdf"]), 1))
-        return SdfField(
-            layers(networks["deformation"], tensors["deformation"], z_sdf),
-            layers(networks["reference"], mi.Float(self.avatar.tensors["reference"])),
-            self.avatar.architecture.sdf_octaves,
+        motion = rigid_motion(mi.TensorXf(tensors["pose"], (6, 1)))
+        return signed_distance_field(
+            self.avatar.architecture, tensors["deformation"], tensors["reference"], z_sdf, motion
         )
 
     def _landmarks(self, avatar: Avatar) -> dict | None:
         """Landmarks that both the head and the photo have: places in reference space, pixels, weights."""
         mean = avatar.tensors["landmarks"]
-        known = np.isfinite(mean).all(axis=1) & np.isfinite(self.portrait.landmarks).all(axis=1)
-        if known.sum() < 6:
+        on_head, x_ref = reference_landmarks(avatar)
+        in_photo = np.isfinite(self.portrait.landmarks).all(axis=1)
+        known = on_head & in_photo
+        if known.sum() < 6 or not avatar.architecture.deforms:
             return None
-        zero = {
-            "z_sdf": mi.Float(np.zeros_like(avatar.tensors["z_sdf"])),
-            "deformation": mi.Float(avatar.tensors["deformation"]),
-        }
-        field = self._field(zero)
-        x_ref = evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
         pixels = self.portrait.landmarks[known].T.astype(np.float32)
         weights = landmark_weights(len(mean))[known].astype(np.float32)
         return {
-            "x_ref": mi.TensorXf(x_ref),
+            "x_ref": mi.TensorXf(np.ascontiguousarray(x_ref[:, in_photo[on_head]])),
             "x": mean[known].T.astype(np.float32),
             "pixels": mi.TensorXf(pixels),
             "weights": mi.TensorXf(weights[None] / weights.sum()),
@@ -117,16 +114,8 @@ class GeometryProblem:
             ) from error
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
-            self._place_landmarks(self._field(self._fixed))
-
-    def _place_landmarks(self, field: SdfField) -> None:
-        x_ref = self.landmarks["x_ref"]
-        with dr.suspend_grad():
-            x = mi.TensorXf(self.landmarks["x"])
-            for _ in range(_LANDMARK_STEPS):
-                x = x - 0.8 * (deform(field, x)[0] - x_ref)
-                dr.eval(x)
-        self.landmarks["placed"] = x
+            field = self._field(self._fixed)
+            self.landmarks["placed"] = placed_landmarks(field, self.landmarks["x_ref"], self.landmarks["x"])
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights = self.settings.geometry
@@ -141,7 +130,7 @@ class GeometryProblem:
             "embedding": weights.embedding * (_square(current["z_sdf"]) + _square(current["z_r"])),
         }
         if self.landmarks is not None:
-            terms["landmark"] = weights.landmark * self._landmark_loss(field)
+            terms["landmark"] = weights.landmark * stage.landmark * self._landmark_loss(field)
         if "deformation" in tensors:
             terms["stay"] = weights.stay * self._stay_loss(field, current, rng)
         return terms
@@ -205,9 +194,44 @@ class GeometryProblem:
         the photo does not show stays what the prior says."""
         points = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_STAY_POINTS, 3)).astype(np.float32)
         x = mi.TensorXf(np.ascontiguousarray(points.T))
-        prior = {"z_sdf": dr.detach(tensors["z_sdf"]), "deformation": mi.Float(self.avatar.tensors["deformation"])}
+        prior = {
+            "z_sdf": dr.detach(tensors["z_sdf"]),
+            "deformation": mi.Float(self.avatar.tensors["deformation"]),
+            "reference": mi.Float(self.avatar.tensors["reference"]),
+            "pose": dr.detach(tensors["pose"]),
+        }
         return losses.mean(dr.abs(deform(field, x)[0] - deform(self._field(prior), x)[0]))
+
+
+def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
+    """Which landmarks [468] bool the mean head has, and the places [3, L] of those in reference space."""
+    mean = prior.tensors["landmarks"]
+    known = np.isfinite(mean).all(axis=1)
+    decoders = mi.Float(prior.tensors["deformation"]), mi.Float(prior.tensors["reference"])
+    zero = mi.TensorXf(np.zeros((len(prior.tensors["z_sdf"]), 1), np.float32))
+    field = signed_distance_field(prior.architecture, *decoders, zero)
+    return known, evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
+
+
+def placed_landmarks(field: SdfField, x_ref, start):
+    """Where the field maps to landmarks' places x_ref [3, L] in reference space: tensor [3, L], found by fixed-point
+    steps from `start` [3, L]. Without gradients."""
+    with dr.suspend_grad():
+        x, x_ref = mi.TensorXf(start), mi.TensorXf(x_ref)
+        for _ in range(_LANDMARK_STEPS):
+            x = x - 0.8 * (deform(field, x)[0] - x_ref)
+            dr.eval(x)
+        return x
 
 
 def _square(latent):
     return dr.sum(latent * latent, axis=None)
+
+
+def moved_camera(camera: Camera, pose: np.ndarray) -> Camera:
+    """The camera that sees an unmoved head as `camera` sees the head moved by a `pose` [6] of the field."""
+    motion = np.eye(4)
+    motion[:3] = rigid_motion(mi.TensorXf(np.reshape(pose, (6, 1)).astype(np.float32))).numpy()
+    u, _, v = np.linalg.svd(motion[:3, :3])
+    motion[:3, :3] = u @ v
+    return replace(camera, world_to_camera=camera.world_to_camera @ np.linalg.inv(motion))

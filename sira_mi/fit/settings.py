@@ -1,8 +1,8 @@
 """All settings of a fit, as data: what each stage optimises, for how long, and how its losses are weighed."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-GEOMETRY, APPEARANCE = "geometry", "appearance"
+GEOMETRY, APPEARANCE, RELIEF = "geometry", "appearance", "relief"
 
 
 @dataclass(frozen=True)
@@ -13,6 +13,7 @@ class Stage:
     steps: int
     rates: dict[str, float]  # learning rate of every optimised avatar tensor; all others are frozen
     mask_sharpness: float = 50.0  # α of the mask loss, per scene unit (IDR: 50 doubling to 1600 on a unit sphere)
+    landmark: float = 1.0  # of the weight of the landmarks: the photo itself is the better judge once the head is near
     k_s: tuple[float, float] = (0.0, 0.0)  # weight of the specular BRDF, first and last step, eq. 8
     k_r: float = 0.0  # weight of the albedo refinement, eq. 11
 
@@ -38,7 +39,16 @@ class AppearanceWeights:
     refinement: float = 0.05  # eq. 12
     embedding: float = 1e-5  # on ‖z‖²
     white_light: float = 0.02  # mean squared log-chroma of the lobes: the prior on the light's colour
+    skin_tone: float = 2e-3  # on the deviation of the skin's albedo from measured skin, in standard deviations
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
+
+
+@dataclass(frozen=True)
+class ReliefWeights:
+    """Weights of the losses of the relief stage."""
+
+    anchor: float = 0.2  # on the mean distance to where the surface was, scene units
+    eikonal: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -52,9 +62,10 @@ class FitSettings:
     pixels: int  # of the appearance stages, a step
     voxel: float  # of the mesh during the fit, scene units
     final_voxel: float  # of the exported mesh, scene units
-    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY or APPEARANCE, stage), in order
+    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY, APPEARANCE or RELIEF, stage), in order
     geometry: GeometryWeights = field(default_factory=GeometryWeights)
     appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
+    relief: ReliefWeights = field(default_factory=ReliefWeights)
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
@@ -66,15 +77,30 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
     return (
-        (GEOMETRY, Stage("latents", steps(160), dict.fromkeys(shape, 6e-2), mask_sharpness=30)),
-        (GEOMETRY, Stage("networks", steps(240), _rates(shape, 6e-3, networks, 4e-4), mask_sharpness=60)),
-        (GEOMETRY, Stage("details", steps(120), _rates(shape, 2e-3, networks, 1.5e-4), mask_sharpness=240)),
+        (GEOMETRY, Stage("latents", steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
+        (
+            GEOMETRY,
+            Stage("networks", steps(240), _rates(shape, 6e-3, networks, 4e-4, 2e-3), mask_sharpness=60, landmark=0.25),
+        ),
+        (
+            GEOMETRY,
+            Stage("details", steps(120), _rates(shape, 2e-3, networks, 1.5e-4, 1e-3), mask_sharpness=240, landmark=0.1),
+        ),
         (APPEARANCE, Stage("light", steps(120), {"z_l": 1e-1, "illumination": 1e-3})),
         (APPEARANCE, Stage("albedo", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 1e-1})),
         (
             APPEARANCE,
             Stage(
                 "speculars", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 3e-2, "z_s": 6e-2}, k_s=(0.0, 1.0)
+            ),
+        ),
+        (
+            RELIEF,
+            Stage(
+                "relief",
+                steps(120),
+                {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2},
+                k_s=(1.0, 1.0),
             ),
         ),
         (
@@ -90,8 +116,17 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
     )
 
 
-def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float) -> dict[str, float]:
-    return {**dict.fromkeys(first, first_rate), **dict.fromkeys(second, second_rate)}
+def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float, pose_rate: float) -> dict[str, float]:
+    return {**dict.fromkeys(first, first_rate), **dict.fromkeys(second, second_rate), "pose": pose_rate}
+
+
+def without(settings: FitSettings, name: str) -> FitSettings:
+    """The same fit with the tensor `name` held fixed in all stages."""
+    stages = tuple(
+        (kind, replace(stage, rates={k: v for k, v in stage.rates.items() if k != name}))
+        for kind, stage in settings.stages
+    )
+    return replace(settings, stages=stages)
 
 
 QUALITIES = {

@@ -15,7 +15,8 @@ Renders a fitted head under another light, and writes IMAGE.exr (linear radiance
 
 The head turns under a light that stays fixed to the world, as does the camera. Two integrators:
   path  path tracing: shadows and interreflections, and noise that falls with --spp; an .exr is the light itself
-  sg    closed form (eq. 8 of SIRA): no noise and quick, but no shadows; spherical Gaussians are fitted to an .exr"""
+  sg    closed form (eq. 8 of SIRA): no noise and quick, shadows and one bounce approximated; spherical Gaussians are
+        fitted to an .exr"""
 _EPILOG = """\
 examples:
   python -m sira_mi.relight avatar --lights scenes/lights/studio.exr --out relit.png

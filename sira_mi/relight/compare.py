@@ -26,8 +26,8 @@ class Comparison:
 
 
 def compare(subject: Subject, light: Light, yaw_degrees: float, settings: RelightSettings, done=None) -> Comparison:
-    """Renders the head by `sira_sg` and by `path` under the same lobes and measures the difference: shadows and
-    interreflections, which the closed form leaves out, its own approximations, and the noise of the samples."""
+    """Renders the head by `sira_sg` and by `path` under the same lobes and measures the difference: what the closed
+    form only approximates, shadows and interreflections among it, and the noise of the samples."""
     closed_form = replace(settings, integrator="sg", samples=CLOSED_FORM_SAMPLES)
     traced = replace(settings, integrator="path")
     shape = load_head(subject, traced)

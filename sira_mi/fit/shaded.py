@@ -1,0 +1,179 @@
+"""The photo's surface points and their radiance by eq. 8, shared by the stages that fit light, albedo and relief."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sira_mi.conventions import LUMINANCE
+from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.columns import from_columns, to_columns
+from sira_mi.fields.mlp import layers
+from sira_mi.fields.sdf import evaluate_in_chunks, surface
+from sira_mi.models.af_sm import AppearanceTraining
+from sira_mi.models.avatar import Avatar
+from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss
+from sira_mi.plugins.neural_sdf import trace_head
+from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.portrait import Portrait
+from sira_mi.scene import sensor
+from sira_mi.sg.shading import shade
+from sira_mi.sg.visibility import arrival, even_directions, received, trace_open
+
+# Directions in which the points' visibility is traced.
+DIRECTIONS = 128
+# Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
+_SKIN_REACH = 0.04
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Surface points at a camera's pixel centres that show the head, N columns."""
+
+    row: np.ndarray  # [N]
+    column: np.ndarray  # [N]
+    origin: np.ndarray  # [3, N] of the ray, field's coordinates
+    view: np.ndarray  # [3, N] unit, from the camera to the point
+    t: np.ndarray  # [1, N] ray parameter of the point
+    x_ref: np.ndarray  # [3, N]
+    gamma: np.ndarray  # [N_γ, N]
+    normal: np.ndarray  # [3, N] unit
+
+    def __getitem__(self, index: np.ndarray) -> SeenPoints:
+        return type(self)(*(np.ascontiguousarray(getattr(self, f.name)[..., index]) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class PhotoPoints(SeenPoints):
+    """Those inside a photo's mask."""
+
+    is_open: np.ndarray  # [K, N] bool: whether light arrives from each of `even_directions(DIRECTIONS)`
+
+
+def seen_points(camera: Camera, head) -> SeenPoints:
+    """The points of a `neural_sdf` that a camera sees."""
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(camera), "head": head})
+    index = dr.arange(mi.UInt32, camera.height * camera.width)
+    centre = mi.Point2f(
+        (mi.Float(index % camera.width) + 0.5) / camera.width, (mi.Float(index // camera.width) + 0.5) / camera.height
+    )
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, centre, mi.Point2f(0.5))
+    t, hit = trace_head(scene, head, ray, mi.Bool(True))
+    chosen = np.flatnonzero(hit.numpy())
+    origin, view, t = ray.o.numpy()[:, chosen], ray.d.numpy()[:, chosen], t.numpy()[None, chosen]
+    field = head.field()
+    x = origin + t * view
+    _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
+    normal = (gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)).astype(np.float32)
+    return SeenPoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
+
+
+def photo_points(portrait: Portrait, head) -> PhotoPoints:
+    """The points of a `neural_sdf` that the portrait shows inside its mask."""
+    seen = seen_points(portrait.camera, head)
+    seen = seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
+    scene = mi.load_dict({"type": "scene", "head": head})
+    place = seen.origin + seen.t * seen.view
+    is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, 0.5 * head.voxel)
+    return PhotoPoints(**vars(seen), is_open=is_open)
+
+
+@dataclass(frozen=True)
+class SkinPatches:
+    """Points of bare facial skin in a photo, which settle the level of the light against the albedo's."""
+
+    points: SeenPoints  # one a landmark
+    radiance: float  # luminance of the photo about them, geometric mean
+
+    def loss(self, avatar: Avatar, tensors: dict):
+        """`skin_tone_loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
+        settings, count = AppearanceTraining(), len(self.points.row)
+        albedo = base_albedo(avatar, tensors, self.points)
+        weight = mi.TensorXf(np.full((1, count), 1 / count, np.float32))
+        usual, deviations = settings.skin_radiance, settings.skin_deviations
+        return skin_tone_loss(albedo, weight, np.array([self.radiance]), usual, deviations)
+
+
+def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:
+    """The points nearest to the photo's landmarks of bare skin; None without a face or where none is seen."""
+    landmarks = portrait.landmarks[list(SKIN_LANDMARKS)]
+    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
+    if not len(landmarks) or not len(points.row):
+        return None
+    reach = _SKIN_REACH * float(np.ptp(portrait.landmarks[np.isfinite(portrait.landmarks[:, 1]), 1]))
+    tree = cKDTree(np.stack([points.column, points.row], axis=1) + 0.5)
+    distance, nearest = tree.query(landmarks)
+    if not (distance < reach).any():
+        return None
+    around = np.unique(np.concatenate(tree.query_ball_point(landmarks[distance < reach], reach)).astype(int))
+    luminance = portrait.image[points.row[around], points.column[around]] @ np.array(LUMINANCE)
+    level = float(np.exp(np.log(np.maximum(luminance, 1e-3)).mean()))
+    return SkinPatches(points[nearest[distance < reach]], level)
+
+
+def decoder(avatar: Avatar, name: str, tensors: dict, latent: str | None = None) -> list[tuple]:
+    """Layers of the network `name` at `tensors` (Floats)."""
+    z = None if latent is None else mi.TensorXf(tensors[latent], (len(tensors[latent]), 1))
+    return layers(avatar.architecture.networks[name], tensors[name], z)
+
+
+def decode_lobes(avatar: Avatar, tensors: dict):
+    """The light [N_l, 7] of the illumination decoder at `tensors` (Floats)."""
+    z_l = mi.TensorXf(tensors["z_l"], (len(tensors["z_l"]), 1))
+    return illumination(decoder(avatar, "illumination", tensors), z_l)[:, :, 0]
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Eq. 8 at some points: what the losses look at. Tensors."""
+
+    lobes: mi.TensorXf  # [N_l, 7]
+    albedo: mi.TensorXf  # [3, N] base diffuse albedo
+    received: mi.TensorXf  # [3, N] irradiance / π, so that the diffuse radiance is the albedo times it
+    specular: mi.TensorXf  # [3, N] radiance, times k_s
+
+
+def shade_points(
+    avatar: Avatar, tensors: dict, k_s: float, points: PhotoPoints, bounce_albedo: np.ndarray, normal=None
+) -> Shading:
+    """Albedos, light and radiance at `points` by the decoders at `tensors` (Floats); `normal` [3, N], a tensor, may
+    stand in for the points' own. Light counts where it arrives; where the head is in its way, one bounce off the head,
+    of diffuse albedo `bounce_albedo` [3], takes its place."""
+    a = avatar.architecture
+    x_ref, view = mi.TensorXf(points.x_ref), mi.TensorXf(points.view)
+    normal = mi.TensorXf(points.normal) if normal is None else normal
+    albedo = base_albedo(avatar, tensors, points)
+    specular = specular_albedo(decoder(avatar, "specular_albedo", tensors, "z_s"), a.specular_octaves, x_ref)
+    lobes = decode_lobes(avatar, tensors)
+    roughness = mi.Float(avatar.roughness)
+    irradiance, glossy = shade(
+        from_columns(normal, mi.Vector3f),
+        from_columns(-view, mi.Vector3f),
+        from_columns(specular, mi.Float),
+        roughness,
+        lobes,
+    )
+    is_open = mi.TensorXf(points.is_open.astype(np.float32))
+    arrives = arrival(normal, -view, specular, roughness, lobes, even_directions(DIRECTIONS), is_open)
+    bounce = mi.TensorXf(np.repeat(bounce_albedo[:, None].astype(np.float32), len(points.row), axis=1))
+    irradiance, glossy = received(to_columns(irradiance), to_columns(glossy), arrives, bounce)
+    return Shading(lobes, albedo, irradiance * (1 / np.pi), glossy * k_s)
+
+
+def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):
+    """Base diffuse albedo [3, N] of points, by the decoders at `tensors` (Floats)."""
+    network = decoder(avatar, "diffuse_albedo", tensors, "z_a")
+    octaves = avatar.architecture.albedo_octaves
+    return diffuse_albedo(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma))
+
+
+def mean_albedo(avatar: Avatar, tensors: dict, points: PhotoPoints) -> np.ndarray:
+    """Mean base diffuse albedo [3] of the points."""
+    network = decoder(avatar, "diffuse_albedo", tensors, "z_a")
+    octaves = avatar.architecture.albedo_octaves
+    columns = evaluate_in_chunks(lambda x, g: diffuse_albedo(network, octaves, x, g), points.x_ref, points.gamma)
+    return columns[0].mean(axis=1)

@@ -1,0 +1,186 @@
+"""The benchmark's methods: what each optimises, that fits are kept and go on from each other, the results page."""
+
+import dataclasses
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import skimage.data
+from PIL import Image
+
+from sira_mi.errors import InputError
+from sira_mi.evaluate import fits, results_page, run_methods
+from sira_mi.evaluate.methods import BY_NAME, METHODS
+from sira_mi.evaluate.run_methods import Job, run
+from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, RELIEF
+from sira_mi.models.avatar import PRIOR, load_avatar
+from sira_mi.models.optimisation import read_arrays
+
+DRAFT = QUALITIES["draft"]
+
+
+def moved(name: str) -> set[str]:
+    """The tensors that a method optimises."""
+    return {tensor for _, stage in BY_NAME[name].settings(DRAFT).stages for tensor in stage.rates}
+
+
+def test_ablations_are_those_of_the_paper():
+    """Figure 4: a.1 moves the latent only, a.2 the decoder too, a.3 the deformation but not a learned appearance; b.1
+    has no latents, b.2 no refinement. Pose and rendering function are everyone's."""
+    shared = {"z_sdf", "pose", "rendering"}
+    assert moved("a.1") == shared
+    assert moved("a.2") == shared | {"deformation", "reference"}
+    assert moved("a.3") == shared | {"deformation"}
+    assert moved("a.4") == shared | {"deformation", "z_r"}
+    assert moved("b.1") == {"illumination", "diffuse_albedo", "specular_albedo"}
+    assert "albedo_refinement" not in moved("b.2") and "albedo_refinement" in moved("b.3")
+    assert "deformation" not in moved("b.3") and "deformation" in moved("b.4")
+    assert not BY_NAME["a.1"].deforms and BY_NAME["a.2"].settings(DRAFT).geometry.stay == 0
+
+
+def test_a_method_and_what_it_goes_on_from_take_the_steps_of_the_fit():
+    """Otherwise the table would compare lengths of optimisation."""
+    lengths = {
+        kind: sum(stage.steps for k, stage in DRAFT.stages if k == kind) for kind in (GEOMETRY, APPEARANCE, RELIEF)
+    }
+    for method in METHODS:
+        steps = sum(stage.steps for _, stage in method.settings(DRAFT).stages)
+        if method.after is None:
+            assert steps == lengths[GEOMETRY]
+        elif method.name in ("b.1", "b.3"):
+            assert steps == lengths[APPEARANCE]
+    shipped = BY_NAME["a.4"].settings(DRAFT).stages + BY_NAME["b.4"].settings(DRAFT).stages
+    assert shipped == DRAFT.stages
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory):
+    path = tmp_path_factory.mktemp("photo") / "photo.png"
+    Image.fromarray(skimage.data.astronaut()).resize((256, 256)).save(path)
+    return path
+
+
+TINY = dataclasses.replace(
+    DRAFT,
+    working_size=128,
+    rays=256,
+    points=64,
+    pixels=256,
+    voxel=0.16,
+    final_voxel=0.12,
+    block=3,
+    stages=tuple((kind, dataclasses.replace(stage, steps=3)) for kind, stage in DRAFT.stages),
+)
+
+
+@pytest.fixture(scope="module")
+def jobs(photo, tmp_path_factory):
+    """A geometry and an appearance method, run."""
+    runs = tmp_path_factory.mktemp("runs")
+    geometry = Job(photo, "a.4", PRIOR, TINY, runs / "a.4", None)
+    shaded = Job(photo, "b.4", PRIOR, TINY, runs / "b.4", runs / "a.4")
+    return [(job, run(job)) for job in (geometry, shaded)]
+
+
+def test_a_fit_leaves_what_it_is_scored_by(jobs):
+    """At the photo's size, whatever the working image's; the appearance goes on from the geometry's very tensors."""
+    for job, result in jobs:
+        assert "error" not in result and result["peak_memory_megabytes"] > 100
+        with np.load(job.out / "head.npz") as head:
+            assert head["image/mask"].shape == (256, 256) and head["image/mask"].max() == 1
+            assert head["image/normal"].shape == (256, 256, 3)
+            assert np.isfinite(head["landmarks"]).all(axis=1).sum() > 300
+            assert ("image/final" in head.files) == (job.method == "b.4")
+    before, _ = read_arrays(jobs[0][0].out / "tensors.safetensors")
+    after, _ = read_arrays(jobs[1][0].out / "tensors.safetensors")
+    assert np.array_equal(before["z_sdf"], after["z_sdf"]) and np.array_equal(before["pose"], after["pose"])
+    assert not np.array_equal(before["deformation"], after["deformation"])
+    assert np.abs(before["pose"]).max() > 0
+
+
+def test_a_fit_is_done_once_and_again_when_what_it_depends_on_changes(jobs, monkeypatch):
+    started = []
+
+    class Process:
+        exitcode = 0
+
+        def __init__(self, target, args):
+            started.append(args[0].method)
+
+        def start(self):
+            pass
+
+        join = start
+
+    monkeypatch.setattr(run_methods.multiprocessing, "get_context", lambda kind: type("C", (), {"Process": Process}))
+    for job, result in jobs:
+        assert run(job) == result
+    assert started == []
+    longer = dataclasses.replace(jobs[0][0], seed=1)
+    with pytest.raises(RuntimeError, match="ended with code"):
+        run(dataclasses.replace(longer, out=longer.out.with_name("other")))
+    assert started == ["a.4"]
+
+
+def test_a_photo_without_a_face_is_a_result_that_says_so(tmp_path):
+    """The table names what failed; it does not stop."""
+    blank = tmp_path / "blank.png"
+    Image.new("RGB", (128, 128), (90, 90, 90)).save(blank)
+    result = run(Job(blank, "a.4", PRIOR, TINY, tmp_path / "a.4", None))
+    assert "no face" in result["error"]
+
+
+def test_the_relief_stage_keeps_to_the_surface_it_starts_from(jobs):
+    """It moves the surface, but by less than a millimetre in the mean in a few steps."""
+    before, after = (
+        mi.load_dict({"type": "neural_sdf", "avatar": str(job.out / "avatar.safetensors"), "voxel": 0.12})
+        for job, _ in jobs
+    )
+    points = before.vertices()
+    on_surface, moved_to = (
+        evaluate_in_chunks(lambda x, head=head: signed_distance(head.field(), x), points)[0][0]
+        for head in (before, after)
+    )
+    # Where the mesh is closed along the domain's box there is no surface.
+    distance = np.abs(moved_to[np.abs(on_surface) < 1e-3])
+    assert len(distance) > 1000 and 0 < distance.mean() < 0.01
+    prior, avatar = load_avatar(), load_avatar(jobs[1][0].out / "avatar.safetensors")
+    assert np.array_equal(prior.tensors["reference"], avatar.tensors["reference"])
+
+
+def rows() -> list[dict]:
+    """Made-up rows of two portraits; scores grow with the portrait."""
+    names = {c.score for c in results_page.GEOMETRY_COLUMNS + results_page.APPEARANCE_COLUMNS}
+    result = []
+    for k, light in enumerate(("studio", "extreme")):
+        for j, method in enumerate((fits.MEAN_HEAD, "a.3", "a.4", "b.4")):
+            scores = {name: 2.0 - 0.4 * j + 0.1 * k for name in names}
+            row = {"portrait": f"p{k}", "identity": f"i{k}", "light": light, "method": method, "scores": scores}
+            if method != fits.MEAN_HEAD:
+                row |= {"seconds": {"latents": 10.0 + k}, "total_seconds": 20.0 + k, "peak_memory_megabytes": 900 + k}
+            result.append(row)
+    return result
+
+
+def test_results_page_says_what_is_reached_and_what_is_missed(tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    monkeypatch.setattr(results_page, "picture", lambda *arguments: np.zeros((4, 4, 3)))
+    failed = {"portrait": "p2", "identity": "i2", "light": "studio", "method": "a.3", "error": "no face found"}
+    page = results_page.write_results([*rows(), failed], tmp_path, tmp_path, tmp_path, "draft").read_text()
+    assert "| face, both directions, mm | ≤ 1.0 | 0.85 | reached |" in page
+    assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in page
+    assert "| final render, dB | ≥ 34 | 0.8 | missed |" in page
+    assert "| p2 | a.3 | no face found |" in page
+    assert (tmp_path / "images" / "results.png").exists()
+
+
+def test_unknown_methods_and_portraits_are_named(tmp_path):
+    (tmp_path / "benchmark.json").write_text(json.dumps({"format": "sira-mi benchmark 1", "portraits": []}))
+    with pytest.raises(InputError, match=r"unknown methods c\.1; known are a\.1"):
+        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("c.1",)))
+    with pytest.raises(InputError, match="prior-without-deformation"):
+        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("a.1",)))
+    with pytest.raises(InputError, match="no such portraits"):
+        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("a.4",)))
