@@ -1,0 +1,428 @@
+"""The benchmark of portraits: which heads and poses, the truth behind a photo, and the folder."""
+
+import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
+
+# isort: split
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+
+from sira_mi.collection import skin
+from sira_mi.collection.lighting import lobe_map, map_directions
+from sira_mi.collection.render import Part, RenderSettings, build_scene, project, render_views
+from sira_mi.collection.sources.makehuman import MakeHumanSource
+from sira_mi.conventions import LUMINANCE
+from sira_mi.errors import InputError
+from sira_mi.evaluate import benchmark
+from sira_mi.evaluate.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
+from sira_mi.evaluate.benchmark_plan import (
+    BenchmarkSettings,
+    Identity,
+    choose_identities,
+    held_out_heads,
+    named_sources,
+    plan,
+)
+from sira_mi.evaluate.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
+from sira_mi.evaluate.truth import load_truth
+from sira_mi.portrait.camera import focal_from_exif
+from sira_mi.portrait.load import linear_to_srgb, load_photo
+
+TINY = PhotoSettings(size=48, samples=16, depth=3, shading_samples=64)
+EVEN = {code: 0.5 for code in range(4)}
+NUMBER, SEED = 7, 4711
+
+
+@pytest.fixture(scope="module", autouse=True)
+def variant():
+    previous = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    yield
+    if previous:
+        mi.set_variant(previous)
+
+
+def ball(radius: float, centre: tuple, albedo: tuple, specular: float, code: int) -> Part:
+    mesh = trimesh.creation.icosphere(subdivisions=5)
+    unit, count = np.asarray(mesh.vertices), len(mesh.vertices)
+    return Part(
+        radius * unit + centre,
+        np.asarray(mesh.faces),
+        unit,
+        np.tile(albedo, (count, 1)),
+        np.full(count, specular),
+        np.full(len(mesh.faces), code),
+    )
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return ball(1.2, (0, 0, 0), (0.5, 0.3, 0.2), 0.5, skin.HAIR)
+
+
+def view_of(parts: list[Part], roughness=EVEN, settings=TINY) -> View:
+    return View(parts, roughness, *portrait_camera(parts, 20, 10, 60, 4.0, settings.size), settings)
+
+
+def identities() -> list[Identity]:
+    """58 invented test heads of three sources."""
+    random = np.random.default_rng(3)
+    heads = []
+    for source, count in (("makehuman", 37), ("ict", 18), ("valid", 3)):
+        for number in range(count):
+            known = source != "ict"
+            group = {
+                "ancestry": str(random.choice(["a", "b", "c", "d"], p=[0.7, 0.1, 0.1, 0.1])) if known else "unknown",
+                "sex": str(random.choice(["male", "female"], p=[0.8, 0.2])) if known else "unknown",
+                "age": str(random.choice(["young", "old"])) if known else "unknown",
+            }
+            hair = bool(random.random() < 0.7)
+            tone = str(random.choice(["dark", "medium", "light"]))
+            heads.append(Identity(source, 8 * number + 7, number, group, {"wig": hair}, tone, hair, True))
+    return heads
+
+
+def test_heads_are_chosen_by_a_rule_from_all_sources():
+    """5, 4 and 3 of the sources; half with hair; several ancestries, every sex, age and tone; in any order of heads."""
+    heads = identities()
+    chosen = choose_identities(heads, 12, 0)
+    assert [head.source for head in chosen] == ["makehuman"] * 5 + ["ict"] * 4 + ["valid"] * 3
+    assert sum(head.hair for head in chosen) >= 6
+    assert {head.tone for head in chosen} == {"dark", "medium", "light"}
+    groups = [head.group for head in chosen if head.source == "makehuman"]
+    assert len({g["ancestry"] for g in groups}) >= 3
+    assert {g["sex"] for g in groups} == {"male", "female"} and {g["age"] for g in groups} == {"young", "old"}
+    shuffled = [heads[k] for k in np.random.default_rng(0).permutation(len(heads))]
+    assert choose_identities(shuffled, 12, 0) == chosen
+    assert choose_identities(heads, 12, 1) != chosen
+    assert len(choose_identities(heads[-5:], 12, 0)) == 5
+
+
+def test_the_plan_spreads_poses_and_lights():
+    """Three lights of each head in one pose; yaws evenly in -40..40 overall and among the primary portraits of each
+    light; four primary portraits a light; no seed twice."""
+    heads = choose_identities(identities(), 12, 0)
+    environments = [Path(f"{k}.exr") for k in range(4)]
+    shots = plan(heads, environments, BenchmarkSettings())
+    assert all([shot.light for shot in mine] == list(LIGHTS) for mine in shots)
+    assert all(len({shot.pose for shot in mine}) == 1 for mine in shots)
+    yaws = sorted(mine[0].pose.yaw for mine in shots)
+    np.testing.assert_allclose(yaws, np.linspace(-40, 40, 12), atol=0.01)
+    primary = [shot for mine in shots for shot in mine if shot.primary]
+    assert len(primary) == 12 and len({shot.seed for mine in shots for shot in mine}) == 36
+    for light in LIGHTS:
+        of_light = [shot for shot in primary if shot.light == light]
+        assert len(of_light) == 4 and len({shot.identity.source for shot in of_light}) >= 2
+        assert np.diff(sorted(shot.pose.yaw for shot in of_light)).min() > 20
+    assert len({shot.environment for shot in primary if shot.light == "outdoor"}) == 4
+    assert all(50 <= shot.pose.focal_35mm <= 85 and abs(shot.pose.pitch) <= 8 for shot in primary)
+    only = plan(heads, environments, BenchmarkSettings(primary_only=True))
+    assert [mine[0] for mine in only] == primary
+
+
+def test_the_camera_has_the_focal_length_of_its_exif_tag_and_shows_the_hair(sphere):
+    """The focal length in pixels is what the portrait front end reads from EXIF; the highest point is in the picture,
+    and the head's middle in the middle column."""
+    K, pose = portrait_camera([sphere], -40, 8, 62.0, 4.6, 512)
+    assert K[0, 0] == pytest.approx(focal_from_exif(62.0, 512, 512), rel=1e-6)
+    assert K[0, 2] == K[1, 2] == 256
+    pixels, depth = project(np.array([[0, 1.2, 0], [0.0, 0, 0]]), K, pose)
+    assert 10 < pixels[0, 1] < 80 and abs(pixels[1, 0] - 256) < 1e-6
+    assert (depth > 0).all()
+    camera = -pose[:3, :3].T @ pose[:3, 3]
+    assert np.degrees(np.arctan2(camera[0], camera[2])) == pytest.approx(-40, abs=0.01)
+
+
+def test_truth_of_a_sphere_under_even_light(sphere):
+    """A convex body under radiance 1 from everywhere: irradiance / pi is 1, nothing is shadowed; mask, normals, region,
+    albedo and reflectance are the sphere's own."""
+    view = view_of([sphere])
+    radiance, mask = view.photograph(np.ones((4, 8, 3)), 1)
+    irradiance, shadow = view.shading(2)
+    truth = view.truth
+    inside = truth["region"] != 255
+    assert set(np.unique(truth["region"])) == {skin.HAIR, 255}
+    np.testing.assert_allclose(irradiance[inside], 1, atol=0.1)
+    np.testing.assert_allclose(irradiance[inside].mean(), 1, atol=0.005)
+    assert shadow[inside].min() > 0.9 and not shadow[~inside].any() and not irradiance[~inside].any()
+    position, pose = -view.world_to_camera[:3, :3].T @ view.world_to_camera[:3, 3], view.world_to_camera
+    way, centre = view.directions(), position
+    along = -(way @ centre)
+    hit = centre + (along - np.sqrt(np.maximum(along**2 - centre @ centre + 1.44, 0)))[..., None] * way
+    rim = np.linalg.norm(np.cross(way, centre), axis=-1)
+    sure = rim < 1.15
+    np.testing.assert_allclose(truth["normal"][sure], hit[sure] / 1.2, atol=0.01)
+    assert inside[sure].all() and not inside[rim > 1.25].any()
+    assert mask[sure].min() == 1 and mask[rim > 1.3].max() == 0
+    K = view.K[0, 0]
+    tangent = np.arcsin(1.2 / np.linalg.norm(pose[:3, 3]))
+    assert mask.sum() == pytest.approx(np.pi * (K * np.tan(tangent)) ** 2, rel=0.05)
+    np.testing.assert_allclose(truth["diffuse_albedo"][inside], np.tile([0.5, 0.3, 0.2], (inside.sum(), 1)), atol=1e-4)
+    np.testing.assert_allclose(truth["specular_albedo"][inside], 0.04, atol=1e-5)
+    np.testing.assert_allclose((radiance[sure] / [0.5, 0.3, 0.2])[:, 0].mean(), 1.05, atol=0.12)
+
+
+def test_shading_of_an_uneven_environment_against_quadrature(sphere):
+    """On a convex body, irradiance / pi under a map with a hard lobe over dim light is the map's sum over solid angle
+    times cosine, and nothing is shadowed, though the photo's light sampling leaves out what is dim."""
+    view = view_of([sphere])
+    lobes = [_lobe(50, 10, HARD, np.ones(3)), _lobe(-60, 30, 3.0, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.1))]
+    light = lobe_map(np.array(lobes))
+    view.photograph(light, 1)
+    irradiance, shadow = view.shading(2)
+    inside = view.truth["region"] != 255
+    directions = map_directions(len(light))
+    solid = np.sqrt(1 - directions[..., 1] ** 2) * (np.pi / len(light)) ** 2
+    cosine = np.maximum(view.truth["normal"][inside] @ directions.reshape(-1, 3).T, 0)
+    reference = cosine @ (light[..., 0] * solid).ravel() / np.pi
+    np.testing.assert_allclose(irradiance[inside][:, 0].mean(), reference.mean(), rtol=0.01)
+    assert np.abs(irradiance[inside][:, 0] - reference).mean() < 0.05 * reference.mean()
+    assert shadow[inside].min() > 0.8 and shadow[inside].mean() > 0.995
+
+
+def test_shadow_of_an_occluder_under_a_hard_light():
+    """A ball in front of a larger one under a small light behind the camera's shoulder: the umbra's pixels get nothing
+    of the direct light, lit ones all of it, and both the photo and the shading are dark in the umbra."""
+    parts = [ball(1.2, (0, 0, 0), (0.4, 0.4, 0.4), 0.3, 0), ball(0.3, (0.0, 0.6, 1.9), (0.4, 0.4, 0.4), 0.3, 1)]
+    view = View(parts, EVEN, *portrait_camera(parts, -35, 0, 60, 5.0, 96), replace(TINY, size=96))
+    light = lobe_map(np.array([_lobe(0, 17.5, HARD, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.02))]))
+    radiance, _ = view.photograph(light, 1)
+    irradiance, shadow = view.shading(2)
+    normal, skinned = view.truth["normal"], view.truth["region"] == 0
+    towards = np.array([0, np.sin(np.radians(17.5)), np.cos(np.radians(17.5))])
+    across = np.linalg.norm(np.cross(1.2 * normal - [0.0, 0.6, 1.9], towards), axis=-1)
+    facing = skinned & (normal @ towards > 0.3)
+    umbra, lit = facing & (across < 0.15), facing & (across > 0.65)
+    assert umbra.sum() > 10 and lit.sum() > 300
+    assert shadow[umbra].max() < 0.2 and shadow[lit].mean() > 0.97
+    np.testing.assert_allclose(irradiance[lit].mean(-1), (normal @ towards)[lit] / np.pi, rtol=0.2, atol=0.02)
+    for image in (radiance, irradiance):
+        assert image[umbra].mean() < 0.25 * image[lit].mean()
+
+
+def test_photo_agrees_with_the_renderer_of_training_scenes(sphere):
+    """With one roughness for all regions, `render_views`, which shares no sampling with it, gives the same photo; at
+    strength 1 its material is the same `principled`."""
+    settings = replace(TINY, size=24, samples=256)
+    sphere = replace(sphere, specular=np.ones(len(sphere.vertices)))
+    view = view_of([sphere], settings=settings)
+    light = light_map("studio", np.random.default_rng(0), 0.0, None, "side")
+    radiance, mask = view.photograph(light, 1)
+    reference = RenderSettings(size=24, samples=1024, depth=3)
+    images, coverage = render_views(
+        build_scene([sphere], light, reference), view.K[None], view.world_to_camera[None], reference, 5
+    )
+    np.testing.assert_allclose(mask, coverage[0], atol=0.08)
+    np.testing.assert_allclose(radiance.mean(), images[0].mean(), rtol=0.01)
+    assert np.abs(radiance - images[0]).mean() < 0.03 * images[0][coverage[0] > 0.5].mean()
+
+
+def test_specular_strength_is_kept_in_levels(sphere):
+    """A part whose strength varies falls into pieces of one strength each; the truth's reflectance is that of the
+    material, next to the part's own; nothing is lost of the surface."""
+    varied = replace(sphere, specular=0.2 + 0.5 * (sphere.normals[:, 0] > 0) + 0.1 * sphere.normals[:, 1])
+    pieces = level_parts(varied, TINY.specular_step)
+    assert sum(len(part.triangles) for part, _ in pieces) == len(varied.triangles)
+    for part, strength in pieces:
+        assert (part.specular == strength).all() and part.triangles.max() < len(part.vertices)
+    truth = view_of([varied]).truth
+    inside = truth["region"] != 255
+    normal = truth["normal"][inside]
+    wanted = 0.08 * (0.2 + 0.5 * (normal[:, 0] > 0) + 0.1 * normal[:, 1])
+    away = np.abs(normal[:, 0]) > 0.1
+    assert np.abs(truth["specular_albedo"][inside] - wanted)[away].max() < 0.08 * 0.03 + 1e-3
+    corners = [part.vertices[part.triangles].sum((1, 2)) for part, _ in pieces]
+    np.testing.assert_allclose(
+        np.sort(np.concatenate(corners)), np.sort(varied.vertices[varied.triangles].sum((1, 2))), atol=1e-9
+    )
+
+
+def test_roughness_of_each_region_enters_the_photo(sphere):
+    """The same ball is another photo when its own region's roughness changes, the same when another region's does."""
+    light = lobe_map(np.array([_lobe(40, 20, 200.0, np.ones(3))]))
+    first, other, unused = (
+        view_of([sphere], EVEN | change).photograph(light, 1)[0] for change in ({}, {skin.HAIR: 0.1}, {skin.CLOTH: 0.1})
+    )
+    assert np.abs(other - first).max() > 0.1 * first.max()
+    assert (unused == first).all()
+
+
+def test_photos_repeat_whatever_the_threads(sphere):
+    """Bit for bit, with one thread and with several."""
+    view = view_of([sphere])
+    light = light_map("extreme", np.random.default_rng(0), 0.0, None, "coloured")
+    first = view.photograph(light, 3)[0], *view.shading(4)
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        again = view.photograph(light, 3)[0], *view.shading(4)
+    finally:
+        dr.set_thread_count(threads)
+    assert all((a == b).all() for a, b in zip(first, again, strict=True))
+    assert (view.photograph(light, 4)[0] != first[0]).any()
+
+
+def test_lights_are_what_they_say():
+    """A lobe gives a facing plate the irradiance it was made for; the extreme lights come from their side; a map is
+    looked up where its pixels are."""
+    directions = map_directions(256)
+    sines = np.sqrt(1 - directions[..., 1] ** 2) * (np.pi / 256) ** 2
+    for sharpness in (12.0, HARD):
+        towards = _lobe(30, 20, sharpness, np.ones(3))[:3]
+        image = lobe_map(_lobe(30, 20, sharpness, np.ones(3))[None], 256)
+        irradiance = (image[..., 0] * np.maximum(directions @ towards, 0) * sines).sum()
+        assert irradiance == pytest.approx(1, rel=1.2 / sharpness + 0.01)
+    for seed in range(5):
+        for kind, front in (("side", True), ("back", False), ("coloured", True)):
+            image = light_map("extreme", np.random.default_rng(seed), 0.0, None, kind)
+            luminance = image @ np.array(LUMINANCE)
+            brightest = map_directions(len(image))[np.unravel_index(luminance.argmax(), luminance.shape)]
+            assert (brightest[2] > 0) == front and luminance.max() > 50 * np.median(luminance)
+    image = np.random.default_rng(0).random((16, 32, 3))
+    np.testing.assert_allclose(look_up(image, map_directions(16)), image, atol=1e-9)
+
+
+def test_exposure_follows_the_albedo_half_way_and_spares_highlights():
+    """A head of four times the albedo is twice as bright; a glint on it is kept below white in the studio."""
+    truth = {
+        "region": np.zeros((10, 10), np.uint8),
+        "K": np.array([[10, 0, 5], [0, 10, 5], [0, 0, 1.0]]),
+        "world_to_camera": np.eye(4),
+    }
+    mask, chin = np.ones((10, 10)), np.array([0, 0.4, 1.0])
+    means = []
+    for albedo in (0.1, 0.4):
+        truth["diffuse_albedo"] = np.full((10, 10, 3), albedo)
+        radiance = np.full((10, 10, 3), 7.0)
+        radiance[9:] = 1.0  # below the chin: does not count
+        means.append(7 * benchmark.exposure_of(radiance, mask, truth, chin, "studio"))
+    assert means[1] == pytest.approx(2 * means[0]) and means[0] == pytest.approx(0.3 * np.sqrt(1 / 3))
+    radiance[:2] = 100.0
+    assert 100 * benchmark.exposure_of(radiance, mask, truth, chin, "studio") <= 1
+    assert 100 * benchmark.exposure_of(radiance, mask, truth, chin, "extreme") <= 1
+
+
+def write_scene(folder: Path, source: str, number: int, seed: int, person: dict, group: dict) -> dict:
+    """A scene file of what the benchmark reads of one, and its manifest entry."""
+    name = f"{source}_{number:04d}.npz"
+    info = {"name": f"{source}/{number:04d}", "seed": seed, "group": group, "person": person}
+    region = np.array([skin.SKIN] * 90 + [skin.CLOTH] * 10)
+    np.savez(folder / name, info=np.array(json.dumps(info)), region=region, albedo=np.full((100, 3), 0.4))
+    return {"file": name, "source": source, "number": number, "seed": seed, "split": "test", "group": group}
+
+
+@pytest.fixture(scope="module")
+def collection(tmp_path_factory):
+    """A collection of one MakeHuman test head and one of a source that is not there."""
+    folder = tmp_path_factory.mktemp("collection")
+    source = MakeHumanSource(8, None)
+    subject = source.subject(NUMBER, SEED)
+    group = subject.group
+    entries = [
+        write_scene(folder, "makehuman", NUMBER, SEED, subject.description, group),
+        write_scene(folder, "valid", 7, 1, {}, group),
+    ]
+    settings = {"sources": {"makehuman": 8, "valid": 8}}
+    (folder / "manifest.json").write_text(json.dumps({"settings": settings, "scenes": entries}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(collection, tmp_path_factory):
+    """The benchmark of the MakeHuman head, and its entries."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    settings = BenchmarkSettings(photo=replace(TINY, samples=4, shading_samples=4))
+    sources = (MakeHumanSource(8, None),)
+    return folder, settings, sources, benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
+
+
+def test_a_benchmark_holds_photos_and_truth(built):
+    """Three portraits with the files and arrays of the contract: the photo is the truth's image in sRGB, it carries its
+    focal length, the truth passes the evaluation's own checks, and the head is in the picture."""
+    folder, settings, _, entries = built
+    assert benchmark.read_benchmark(folder) == entries
+    assert [entry["light"] for entry in entries] == list(LIGHTS)
+    assert [entry["primary"] for entry in entries] == [True, False, False]
+    for entry in entries:
+        assert entry["name"] == f"makehuman_0007_{entry['light']}" and entry["identity"] == "makehuman/0007"
+        assert entry["clothes"] and not entry["hair"] and entry["clipped"] < 0.2
+        photo = load_photo(folder / entry["name"] / "photo.jpg")
+        assert photo.focal_35mm == round(entry["focal_35mm"])
+        with np.load(folder / entry["name"] / "truth.npz", allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        assert list(arrays) == list(benchmark.TRUTH)
+        for name, text in benchmark.TRUTH.items():
+            kind = text.split("] ")[1].split(",")[0].split(" ")[0]
+            assert arrays[name].dtype == {"f4": "f4", "u1": "u1", "i4": "i4", "bool": "?"}[kind], name
+        truth = load_truth(folder / entry["name"] / "truth.npz")
+        assert np.abs(linear_to_srgb(np.clip(truth.image, 0, 1)) - linear_to_srgb(photo.image)).mean() < 0.02
+        assert truth.mask[24, 24] == 1 and 0.2 < truth.mask.mean() < 0.9 and not truth.mask[:2].any()
+        off = truth.region == 255
+        for name in ("diffuse_albedo", "shading", "shadow", "normal"):
+            assert not getattr(truth, name)[off & (truth.mask == 0)].any(), name
+        pixels, _ = project(
+            truth.landmarks[np.isfinite(truth.landmarks).all(1)], arrays["K"], arrays["world_to_camera"]
+        )
+        assert ((pixels > 0) & (pixels < settings.photo.size)).all()
+        assert {0, 2, 3} <= set(np.unique(truth.face_region))
+
+
+def test_portraits_that_are_there_are_kept(built, collection, monkeypatch):
+    """A second build takes nothing; a portrait whose photo is gone is taken again, to the same bits; other settings
+    take all anew."""
+    folder, settings, sources, entries = built
+    taken = []
+    original = benchmark.portrait
+
+    def spy(view, subject, shot):
+        taken.append(shot.name)
+        return original(view, subject, shot)
+
+    monkeypatch.setattr(benchmark, "portrait", spy)
+    assert benchmark.build_benchmark(collection, folder, sources, None, 1, settings) == entries
+    assert not taken
+    photo = folder / entries[1]["name"] / "photo.jpg"
+    before = photo.read_bytes()
+    photo.unlink()
+    with pytest.raises(InputError, match="is missing"):
+        benchmark.read_benchmark(folder)
+    benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
+    assert taken == [entries[1]["name"]] and photo.read_bytes() == before
+    finer = replace(settings.photo, samples=16)
+    head = plan(choose_identities(held_out_heads(collection)[:1], 1, 0), [], settings)[0]
+    assert all(benchmark.finished_entry(folder / shot.name, shot.key(settings.photo)) for shot in head)
+    assert not any(benchmark.finished_entry(folder / shot.name, shot.key(finer)) for shot in head)
+
+
+def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
+    """Sources without data, unknown sources, a head that the data do not give again, no maps, damaged files."""
+    none = dict.fromkeys(("hair", "ict", "valid", "meshes"))
+    with pytest.raises(InputError, match="give its data by --valid"):
+        named_sources(collection, None, none)
+    with pytest.raises(InputError, match="no test heads of ict"):
+        named_sources(collection, ["ict"], none)
+    assert [source.name for source in named_sources(collection, ["makehuman"], none)] == ["makehuman"]
+    head = held_out_heads(collection)[0]
+    with pytest.raises(InputError, match="is not the collection's"):
+        benchmark.rebuilt(MakeHumanSource(8, None), replace(head, person={"other": 1}))
+    with pytest.raises(InputError, match=r"no \.exr"):
+        benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), tmp_path, 1)
+    with pytest.raises(InputError, match="no benchmark"):
+        benchmark.read_benchmark(tmp_path)
+    for text in ("[]", '{"format": "other"}', '{"format": "sira-mi benchmark 1", "portraits": [{"name": "../x"}]}'):
+        (tmp_path / "benchmark.json").write_text(text)
+        with pytest.raises(InputError, match=r"benchmark\.json"):
+            benchmark.read_benchmark(tmp_path)
+
+
+def test_the_page_lists_the_truth():
+    """The table of `docs/benchmark.md` is `TRUTH`."""
+    page = (Path(__file__).resolve().parent.parent / "docs" / "benchmark.md").read_text(encoding="utf-8")
+    for name, content in benchmark.TRUTH.items():
+        assert f"| `{name}` | {content} |" in page, name
