@@ -2,7 +2,7 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is SIRA, with the refinement, and b.4 the fit as it ships, with the relief stage too.
+schedule, b.3 is the fit as it ships, with the refinement, and b.4 adds a relief stage.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage, with_relief
 from sira_mi.models.af_sm import initial_appearance_model
 from sira_mi.models.avatar import Avatar
 
@@ -82,8 +82,10 @@ def _without_prior(shipped: Stages) -> Stages:
     return ((APPEARANCE, Stage("without prior", steps, rates, k_s=(1.0, 1.0))),)
 
 
-def _after_geometry(shipped: Stages) -> Stages:
-    return tuple(entry for entry in shipped if entry[0] != GEOMETRY)
+def _with_relief(shipped: Stages) -> Stages:
+    """As many relief steps as the albedo stage has."""
+    stages = _of_kind(APPEARANCE)(shipped)
+    return with_relief(stages, next(stage.steps for _, stage in stages if stage.name == "albedo"))
 
 
 def _without_refinement(shipped: Stages) -> Stages:
@@ -114,7 +116,7 @@ METHODS = (
     Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
-    Method("b.3", "SIRA: with refinement", _of_kind(APPEARANCE), _unchanged, after="a.4"),
-    Method("b.4", "with relief: the shipped fit", _after_geometry, _unchanged, after="a.4"),
+    Method("b.3", "with refinement: the shipped fit", _of_kind(APPEARANCE), _unchanged, after="a.4"),
+    Method("b.4", "with a relief stage", _with_relief, _unchanged, after="a.4"),
 )
 BY_NAME = {method.name: method for method in METHODS}

@@ -74,7 +74,7 @@ def _of(method: str, score: str) -> Callable[[dict], float]:
 
 
 def _over_mean_head(rows: dict) -> float:
-    return mean(rows.get("b.4", ()), "h3ds_face_mean") / mean(rows.get(MEAN_HEAD, ()), "h3ds_face_mean")
+    return mean(rows.get("b.3", ()), "h3ds_face_mean") / mean(rows.get(MEAN_HEAD, ()), "h3ds_face_mean")
 
 
 def _best_ablation(rows: dict) -> float:
@@ -91,18 +91,18 @@ def at_least(limit: float) -> Callable[[float], bool]:
 
 
 MARKS = (
-    Mark("face, both directions, mm", "≤ 1.0", _of("b.4", "h3ds_face_mean"), at_most(1.0)),
+    Mark("face, both directions, mm", "≤ 1.0", _of("b.3", "h3ds_face_mean"), at_most(1.0)),
     Mark("the same over the mean head's", "≤ 0.7", _over_mean_head, at_most(0.7)),
-    Mark("face in the photo's camera frame, no ICP, mm", "≤ 1.5", _of("b.4", "camera_face_mean"), at_most(1.5)),
-    Mark("face normals, °", "≤ 8", _of("b.4", "normals_mean"), at_most(8), 1),
+    Mark("face in the photo's camera frame, no ICP, mm", "≤ 1.5", _of("b.3", "camera_face_mean"), at_most(1.5)),
+    Mark("face normals, °", "≤ 8", _of("b.3", "normals_mean"), at_most(8), 1),
     Mark("a.4 minus the best of a.1 to a.3, mm", "≤ 0", _best_ablation, at_most(0)),
-    Mark("silhouette IoU", "≥ 0.97", _of("b.4", "silhouette_iou"), at_least(0.97), 3),
-    Mark("final render, dB", "≥ 34", _of("b.4", "final_psnr"), at_least(34), 1),
-    Mark("final render, SSIM", "≥ 0.95", _of("b.4", "final_ssim"), at_least(0.95)),
-    Mark("diffuse albedo, dB", "≥ 23", _of("b.4", "diffuse_psnr"), at_least(23), 1),
-    Mark("diffuse albedo, SSIM", "≥ 0.88", _of("b.4", "diffuse_ssim"), at_least(0.88)),
-    Mark("specular albedo, dB", "≥ 19.5", _of("b.4", "specular_psnr"), at_least(19.5), 1),
-    Mark("specular albedo, SSIM", "≥ 0.71", _of("b.4", "specular_ssim"), at_least(0.71)),
+    Mark("silhouette IoU", "≥ 0.97", _of("b.3", "silhouette_iou"), at_least(0.97), 3),
+    Mark("final render, dB", "≥ 34", _of("b.3", "final_psnr"), at_least(34), 1),
+    Mark("final render, SSIM", "≥ 0.95", _of("b.3", "final_ssim"), at_least(0.95)),
+    Mark("diffuse albedo, dB", "≥ 23", _of("b.3", "diffuse_psnr"), at_least(23), 1),
+    Mark("diffuse albedo, SSIM", "≥ 0.88", _of("b.3", "diffuse_ssim"), at_least(0.88)),
+    Mark("specular albedo, dB", "≥ 19.5", _of("b.3", "specular_psnr"), at_least(19.5), 1),
+    Mark("specular albedo, SSIM", "≥ 0.71", _of("b.3", "specular_ssim"), at_least(0.71)),
 )
 
 
@@ -129,8 +129,8 @@ def write_results(rows: Sequence[dict], benchmark: Path, runs: Path, out: Path, 
     if errors := [row for row in rows if "error" in row]:
         lines = [[row["portrait"], row["method"], row["error"]] for row in errors]
         sections.append("## Fits that failed\n\n" + table(("portrait", "method", "error"), lines))
-    if "b.4" in methods:
-        shown = [row["portrait"] for row in methods["b.4"] if "scores" in row][:_SHEET_PORTRAITS]
+    if "b.3" in methods:
+        shown = [row["portrait"] for row in methods["b.3"] if "scores" in row][:_SHEET_PORTRAITS]
         write_png(out / "images" / "results.png", picture(shown, benchmark, runs))
         sections.append(_PICTURE_TEXT)
     page = out / "results.md"
@@ -165,19 +165,19 @@ def _methods_table(methods: dict, columns: Sequence[Column], shaded: bool) -> st
 
 def _by_light(methods: dict) -> str:
     columns = (*GEOMETRY_COLUMNS[:1], *GEOMETRY_COLUMNS[5:6], *GEOMETRY_COLUMNS[8:], *APPEARANCE_COLUMNS)
-    rows = methods.get("b.4", [])
+    rows = methods.get("b.3", [])
     lights = sorted({row["light"] for row in rows})
     lines = [
         [light, *(number(mean([r for r in rows if r["light"] == light], c.score), c.digits) for c in columns)]
         for light in lights
     ]
-    return table(("b.4", *(c.title for c in columns)), lines)
+    return table(("b.3", *(c.title for c in columns)), lines)
 
 
 def _by_portrait(methods: dict) -> str:
     heads = {row["portrait"]: row for row in methods[MEAN_HEAD]}
     lines = []
-    for row in methods.get("b.4", []):
+    for row in methods.get("b.3", []):
         if "scores" in row:
             scores, mean_head = row["scores"], heads[row["portrait"]]["scores"]
             lines.append(
@@ -189,7 +189,7 @@ def _by_portrait(methods: dict) -> str:
                 ]
             )
     titles = [c.title for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]] + [c.title for c in APPEARANCE_COLUMNS[:7]]
-    return table(("b.4", "mean head", *titles), lines)
+    return table(("b.3", "mean head", *titles), lines)
 
 
 def _costs(methods: dict) -> str:
@@ -208,7 +208,7 @@ def _costs(methods: dict) -> str:
 def picture(portraits: Sequence[str], benchmark: Path, runs: Path) -> np.ndarray:
     """Display values: a row for each portrait, the photo, then fitted and true final render, normals, diffuse and
     specular albedo side by side."""
-    return np.concatenate([_picture_row(benchmark / name, runs / name / "b.4") for name in portraits])
+    return np.concatenate([_picture_row(benchmark / name, runs / name / "b.3") for name in portraits])
 
 
 def _picture_row(folder: Path, fit: Path) -> np.ndarray:

@@ -95,15 +95,6 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
             ),
         ),
         (
-            RELIEF,
-            Stage(
-                "relief",
-                steps(120),
-                {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2},
-                k_s=(1.0, 1.0),
-            ),
-        ),
-        (
             APPEARANCE,
             Stage(
                 "refinement",
@@ -114,6 +105,15 @@ def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
             ),
         ),
     )
+
+
+def with_relief(stages: tuple[tuple[str, Stage], ...], steps: int) -> tuple[tuple[str, Stage], ...]:
+    """The stages with a relief stage of so many steps before the refinement, which no shipped quality has: it helps the
+    albedo and, so far, not the surface."""
+    rates = {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2}
+    stage = Stage("relief", steps, rates, k_s=(1.0, 1.0))
+    first = next(number for number, (_, other) in enumerate(stages) if other.k_r > 0)
+    return (*stages[:first], (RELIEF, stage), *stages[first:])
 
 
 def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float, pose_rate: float) -> dict[str, float]:
