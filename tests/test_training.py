@@ -190,7 +190,7 @@ def test_the_command_trains_both_models_at_the_given_sizes(run, collection):
     assert train.read_architecture(metadata, run / "shape.checkpoint") == SMALL
     assert metadata["step"] == "10" and parameters["z_sdf"].shape == (SMALL.sdf_latent, 3)
     assert load_avatar(run / "prior.safetensors").architecture == SMALL
-    for name in ("shape_000008", "appearance_000004"):
+    for name in ("shape_000010", "appearance_000004"):
         from PIL import Image
 
         picture = np.asarray(Image.open(run / "pictures" / f"{name}.png"))

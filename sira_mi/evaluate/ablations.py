@@ -86,6 +86,7 @@ def ablation(collection: Path, evidence: Path, without: str | None, steps: int, 
             "color": float(np.mean(shape_prior.color_errors(model, scans, w, protocol.color_steps))),
             "gradient": float(np.mean([row["gradient"] for row in rows])),
             "connected": float(np.mean([row["parts"] == 1 for row in rows])),
+            "sizes": {size: getattr(model.architecture, size) for size in SIZES},
         }
 
     return _trained(collection, evidence / "ablations", name, steps, protocol, measure, without=without)

@@ -225,11 +225,12 @@ def ablations_section(evidence: Path) -> str:
         )
     head = ["training", "the term", "face, mm", "head, mm", "normals, °", "|∇f| in 0.9–1.1"]
     head += ["landmark spread, mm", "colour", "connected"]
-    return f"""The SA-SM trained for {results[0]["steps"]} steps with all terms, and with one weight at zero. These
-trainings are short and only comparable with one another. All are measured alike on {results[0]["scans"]} test scans:
-distances from scan to surface after the latents are fitted, normals on the head without hair, the gradient and
-connectedness of random heads at 1σ, the spread of landmarks in reference space, and the difference of square roots of
-radiance after z_r is fitted too.
+    sizes = ", ".join(f"{name} {size}" for name, size in results[0]["sizes"].items())
+    return f"""The SA-SM ({sizes})
+trained for {results[0]["steps"]} steps with all terms, and with one weight at zero. These trainings are short and only
+comparable with one another. All are measured alike on {results[0]["scans"]} test scans: distances from scan to surface
+after the latents are fitted, normals on the head without hair, the gradient and connectedness of random heads at 1σ,
+the spread of landmarks in reference space, and the difference of square roots of radiance after z_r is fitted too.
 
 {table(head, lines)}"""
 
