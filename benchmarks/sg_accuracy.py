@@ -4,7 +4,8 @@ The closed forms of `sira_mi/sg/shading.py` run in single precision; the quadrat
 anew. Each cell is the largest error over 96 light directions relative to the largest value: PhySG's form (with this
 project's cosine integral, so that the error of PhySG's two-term cosine is not in it), then this project's. Half of the
 directions are spread over the sphere, the other half are reflections about half vectors that follow the normal
-distribution, so that lights narrower than the reflectance meet it.
+distribution, so that lights narrower than the reflectance meet it. A second, denser grid of views, roughnesses and
+sharpnesses, with the quadrature of `specular_quadrature.py`, gives the range within which an error is promised.
 """
 
 import argparse
@@ -18,13 +19,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from fit_cosine_integral import hemisphere_quadrature
+from specular_quadrature import grid_integrals, views
 
 SHARPNESSES = (1e-3, 0.3, 5.0, 30.0, 200.0, 1e3, 1e5)
-TABULATED_ROUGHNESS = 0.2  # the closed form's tables begin here
+TABULATED_ROUGHNESS = 0.1  # the closed form's tables begin here
 ROUGHNESSES = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 VIEW_ANGLES = (0, 45, 60, 75, 85)  # degrees from the normal
 ALBEDOS = (0.05, 0.375)  # specular albedo
 DIRECTIONS = 96  # light directions of a cell
+# The dense grid of the promised range, and the promise: largest error, %, up to a view angle in degrees.
+DENSE_VIEW_ANGLES = (*range(0, 70, 5), *range(70, 86, 3))
+DENSE_ROUGHNESSES = tuple(round(0.2 + 0.05 * k, 2) for k in range(11))
+DENSE_SHARPNESSES = tuple(2.0 * 1000.0 ** (k / 10.0) for k in range(11))
+DENSE_ALBEDOS = (0.03, 0.05, 0.375)
+PROMISED = ((70, 5.0), (85, 15.0))
 TIMED_POINTS, TIMED_LOBES = 2**17, (1, 64)
 
 
@@ -155,6 +163,46 @@ def specular_table(nodes: int) -> None:
         print(f"| worst of {TABULATED_ROUGHNESS:g} to 1 | | {angle}° | " + " | ".join(cells) + " |")
 
 
+def dense_errors(angles, roughnesses, sharpnesses, nodes: int) -> np.ndarray:
+    """Largest errors of this project's form over light directions, as shares of the largest value: views in degrees ×
+    roughnesses × sharpnesses × `DENSE_ALBEDOS`."""
+    from sira_mi.sg import specular
+
+    cosines = np.cos(np.radians(angles))
+    axes, exact = grid_integrals(cosines, np.array(roughnesses), np.array(sharpnesses), DIRECTIONS, nodes)
+    shape = exact.shape[1:]
+    axis = np.broadcast_to(axes[:, :, None], (*shape, 3)).reshape(-1, 3)
+    view = np.broadcast_to(views(cosines)[:, None, None, None], (*shape, 3)).reshape(-1, 3)
+    lobes = specular.specular_lobes(
+        mi.Vector3f(0, 0, 1),
+        mi.Vector3f(np.ascontiguousarray(view.T)),
+        mi.Float(np.broadcast_to(np.array(roughnesses)[:, None, None], shape).ravel()),
+    )
+    sharpness = mi.Float(np.broadcast_to(np.array(sharpnesses)[:, None], shape).ravel())
+    parts = specular.specular_integrals(lobes, mi.Vector3f(np.ascontiguousarray(axis.T)), sharpness)
+    value = np.stack([part.numpy().astype(np.float64).reshape(shape) for part in parts])
+    errors = []
+    for albedo in DENSE_ALBEDOS:
+        mixed, truth = (albedo * x[0] + (1.0 - albedo) * x[1] for x in (value, exact))
+        errors.append(np.abs(mixed - truth).max(axis=-1) / truth.max(axis=-1))
+    return np.stack(errors, axis=-1)
+
+
+def range_table(nodes: int) -> None:
+    """Prints the errors on the dense grid and the largest within the promised ranges."""
+    errors = 100.0 * dense_errors(DENSE_VIEW_ANGLES, DENSE_ROUGHNESSES, DENSE_SHARPNESSES, nodes)
+    names = ", ".join(f"{x:g}" for x in DENSE_ALBEDOS)
+    print(f"\nSpecular, dense: largest error over λ = 2 to 2000 ({len(DENSE_SHARPNESSES)} values), albedos {names} and")
+    print("light directions, % of the largest value over these")
+    print("| view | " + " | ".join(f"r = {r:g}" for r in DENSE_ROUGHNESSES) + " |")
+    print("|---" * (1 + len(DENSE_ROUGHNESSES)) + "|")
+    for angle, row in zip(DENSE_VIEW_ANGLES, errors.max(axis=(2, 3)), strict=True):
+        print(f"| {angle}° | " + " | ".join(f"{x:.1f}" for x in row) + " |")
+    for angle, promised in PROMISED:
+        largest = errors[np.array(DENSE_VIEW_ANGLES) <= angle].max()
+        print(f"\nViews to {angle}°: at most {largest:.2f}% (promised: {promised:g}%)")
+
+
 def diffuse_table() -> None:
     """Prints the errors of the irradiance, which PhySG takes from two more Gaussians and this project does not."""
     from sira_mi.sg import integrals
@@ -211,6 +259,7 @@ def main() -> None:
     parser.add_argument("--variant", default="llvm_ad_rgb")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)
+    range_table(arguments.nodes // 2)
     specular_table(arguments.nodes)
     diffuse_table()
     timing_table()

@@ -126,44 +126,110 @@ def test_product_and_inner_product_match_float64():
     np.testing.assert_allclose(together.numpy(), (separate[0] * separate[1]).numpy(), rtol=1e-4, atol=1e-7)
 
 
-def specular_quadrature(cosine, roughness, albedo, sharpness, axes):
-    """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ for n = z in float64: straight from the definition, cosines not cancelled."""
-    z, wz = 0.5 * (np.polynomial.legendre.leggauss(128)[0] + 1), 0.5 * np.polynomial.legendre.leggauss(128)[1]
-    phi = 2 * np.pi * (np.arange(256) + 0.5) / 256
-    rim = np.sqrt(1 - z**2)[:, None]
-    light = np.stack([rim * np.cos(phi), rim * np.sin(phi), np.broadcast_to(z[:, None], (128, 256))], -1).reshape(-1, 3)
-    weight = np.repeat(wz, 256) * 2 * np.pi / 256
-    view = np.array([np.sqrt(1 - cosine**2), 0.0, cosine])
+def nodes_around(sharpness, count=48):
+    """Offsets [Q, 3] around +z and weights [Q] that sum to ∫ exp(λ(z − 1)) dω over the hemisphere around +z."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    reach = np.sqrt(min(sharpness, 36.0))
+    t = 0.5 * reach * (node + 1)
+    gap = np.repeat(t**2 / sharpness, 2 * count)
+    ring = np.repeat(np.exp(-(t**2)) * t * reach * weight / sharpness * np.pi / count, 2 * count)
+    phi = np.tile(np.pi * (np.arange(2 * count) + 0.5) / count, count)
+    sine = np.sqrt(gap * (2 - gap))
+    return np.stack([sine * np.cos(phi), sine * np.sin(phi), 1 - gap], axis=1), ring
+
+
+def specular_reflectance(light, view, roughness):
+    """f^s (ω·n) of directions [Q, 3] for n = z, straight from the definition: its parts [2, Q] for F = 1 and F = P."""
+    light_z = np.maximum(light[:, 2], 1e-12)
     half = light + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    density = np.exp(2 / roughness**4 * (half[:, 2] - 1)) / (np.pi * roughness**4)
-    fresnel = albedo + (1 - albedo) * 2.0 ** (-(5.55473 * (half @ view) + 6.8316) * (half @ view))
+    density = np.exp(-1 / roughness**4 * ((half - (0, 0, 1)) ** 2).sum(axis=1)) / (np.pi * roughness**4)
     k = (roughness + 1) ** 2 / 8
-    shadow = light[:, 2] / (light[:, 2] * (1 - k) + k) * cosine / (cosine * (1 - k) + k)
-    specular = density * fresnel * shadow / (4 * light[:, 2] * cosine)
-    lobe = np.exp(sharpness * (light @ axes.T - 1))
-    return (lobe * (specular * light[:, 2] * weight)[:, None]).sum(axis=0)
+    shadow = light_z / (light_z * (1 - k) + k) * view[2] / (view[2] * (1 - k) + k)
+    white = np.where(light[:, 2] > 0, density * shadow / (4 * view[2]), 0.0)
+    return np.stack([white, white * 2.0 ** (-(5.55473 * (half @ view) + 6.8316) * (half @ view))])
 
 
-def test_specular_closed_form_against_quadrature():
-    """Largest error over light directions, relative to the largest value, beside PhySG's form; the table is printed."""
-    axes = lobes.fibonacci_directions(150)
-    print("\nroughness 0.5: worst error relative to the peak, PhySG -> this closed form")
-    for albedo in (0.05, 0.375):
-        for angle in (0, 45, 60, 70, 82):
-            cells = []
-            for sharpness, bound in ((0.3, 0.015), (5.0, 0.06), (30.0, 0.1), (200.0, 0.25)):
-                cosine = np.cos(np.radians(angle))
-                exact = specular_quadrature(cosine, ROUGHNESS, albedo, sharpness, axes)
-                view = mi.Vector3f(float(np.sin(np.radians(angle))), 0, float(cosine)) + dr.zeros(mi.Vector3f, 150)
-                arguments = mi.Vector3f(0, 0, 1), view, mi.Float(albedo), mi.Float(ROUGHNESS)
-                arguments += mi.Vector3f(axes.T), mi.Float(sharpness), mi.Color3f(1)
-                value = [f(*arguments).x.numpy() for f in (shading.specular_radiance_physg, shading.specular_radiance)]
-                physg, improved = (np.abs(x - exact).max() / exact.max() for x in value)
-                cells.append(f"λ={sharpness:g}: {physg:.3f} -> {improved:.3f}")
-                assert improved < bound, (albedo, angle, sharpness)
-                assert improved < max(physg, 0.05)
-            print(f"  s={albedo} view {angle:2d}°  " + "   ".join(cells))
+def specular_quadrature(view, roughness, sharpness, axes):
+    """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ [2, D] in float64, the nodes around the sharper of the light's axis and n, where
+    they are half vectors."""
+    distribution = 2 / roughness**4
+    if sharpness > 1.5 * distribution:
+        offsets, weight = nodes_around(sharpness)
+        across = [np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]) for axis in axes]
+        frames = [np.stack([t, np.cross(axis, t)]) / np.linalg.norm(t) for axis, t in zip(axes, across, strict=True)]
+        lights = (offsets @ np.concatenate([f, axis[None]]) for f, axis in zip(frames, axes, strict=True))
+        return np.stack([specular_reflectance(light, view, roughness) @ weight for light in lights], axis=1)
+    half, weight = nodes_around(distribution)
+    half, weight = half[half @ view > 0], weight[half @ view > 0]
+    cosine = half @ view
+    light = 2 * cosine[:, None] * half - view
+    # dω = 4 (v·h) dh, and the weights contain what D is but for its norm.
+    weight = weight * np.exp(distribution * (1 - half[:, 2])) * 4 * cosine
+    return (specular_reflectance(light, view, roughness) * weight) @ np.exp(sharpness * (light @ axes.T - 1))
+
+
+def reflecting_view(degrees, roughness, count=50):
+    """A view in the plane y = 0 and lights [2 count, 3] to test there: even ones, and reflections about half vectors
+    that follow the normal distribution."""
+    view = np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+    spread = roughness**2 / np.sqrt(2) * np.random.default_rng(8).standard_normal((count, 2))
+    half = np.concatenate([spread, np.ones((count, 1))], axis=1)
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    return view, np.concatenate([lobes.fibonacci_directions(count), 2 * (half @ view)[:, None] * half - view])
+
+
+def specular_form(function, view, roughness, albedo, sharpness, axes):
+    value = function(
+        mi.Vector3f(0, 0, 1),
+        mi.Vector3f(*(float(x) for x in view)),
+        mi.Float(albedo),
+        mi.Float(roughness),
+        mi.Vector3f(np.ascontiguousarray(axes.T)),
+        mi.Float(sharpness),
+        mi.Color3f(1),
+    )
+    return value.x.numpy()
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.45, 0.7])
+def test_specular_closed_form_against_quadrature(roughness):
+    """Largest error over light directions, relative to the largest value: within 2.5% to 70° and 6% to 85°, half of
+    what is promised, for sharpness 2 to 2000. Beside PhySG's form; the table is printed."""
+    print(f"\nroughness {roughness:g}: worst error, % of the peak, PhySG -> this closed form")
+    for degrees, bound in ((0, 0.025), (45, 0.025), (70, 0.025), (85, 0.06)):
+        view, axes = reflecting_view(degrees, roughness)
+        cells = []
+        for sharpness in (2.0, 30.0, 200.0, 2000.0):
+            white, grazing = specular_quadrature(view, roughness, sharpness, axes)
+            errors = []
+            for albedo in (0.03, 0.05, 0.375):
+                exact = albedo * white + (1 - albedo) * grazing
+                values = [
+                    specular_form(f, view, roughness, albedo, sharpness, axes)
+                    for f in (shading.specular_radiance_physg, shading.specular_radiance)
+                ]
+                errors.append([np.abs(value - exact).max() / exact.max() for value in values])
+            physg, ours = np.max(errors, axis=0)
+            cells.append(f"λ={sharpness:g}: {100 * physg:.1f} -> {100 * ours:.1f}")
+            assert ours < bound, (degrees, sharpness)
+            assert ours < max(physg, 0.01)
+        print(f"  view {degrees:2d}°  " + "   ".join(cells))
+
+
+def test_constant_light_is_reflected_by_the_exact_energy():
+    """The directional albedo, for sharpness 0: within 1% at every roughness of the tables; in float32, and continuous
+    to very broad lights."""
+    axis = np.array([[0.0, 0.6, 0.8]])
+    for roughness in (0.1, 0.2, 0.4, 0.7, 1.0):
+        for degrees in (0, 40, 70, 85):
+            view, _ = reflecting_view(degrees, roughness)
+            white, grazing = specular_quadrature(view, roughness, 0.0, axis)
+            for albedo in (0.03, 0.375, 1.0):
+                exact = albedo * white + (1 - albedo) * grazing
+                for sharpness in (0.0, 1e-4):
+                    value = specular_form(shading.specular_radiance, view, roughness, albedo, sharpness, axis)
+                    assert value == pytest.approx(exact, rel=0.01), (roughness, degrees, albedo)
 
 
 def test_shade_equals_its_reference():
@@ -258,17 +324,18 @@ def test_shade_inside_a_symbolic_loop():
 
 
 def test_extreme_inputs_give_finite_values_and_gradients():
-    """Sharpness from 1e-3 to 1e5, lights behind, views grazing, below and along the normal, every roughness."""
+    """Sharpness from 0 to 1e7, lights behind, views grazing, below and along the normal, every roughness."""
     normal, view = random_points(40, 2)
     view[:, :10] = normal[:, :10]
     view[:, 10:20] -= 2 * (normal * view).sum(axis=0)[10:20] * normal[:, 10:20]
     view[:, 20:25] -= (normal * view).sum(axis=0)[20:25] * normal[:, 20:25]
     view /= np.linalg.norm(view, axis=0)
     set_of_lobes = lobes.initial_lobes(30)
-    set_of_lobes[:, 3] = np.geomspace(1e-3, 1e5, 30)
+    set_of_lobes[:, 3] = [0.0, *np.geomspace(1e-6, 1e7, 29)]
     set_of_lobes[:3, :3] = -normal.T[:3]
     set_of_lobes[3:6, :3] = normal.T[3:6]
-    for roughness in (0.05, 0.2, 0.5, 1.0):
+    set_of_lobes[26:, :3] = [-normal[:, 0], normal[:, 1], view[:, 20], -view[:, 21]]
+    for roughness in (0.02, 0.05, 0.2, 0.5, 1.0):
         inputs = mi.Vector3f(normal), mi.Vector3f(view), mi.Float(0.3), mi.TensorXf(set_of_lobes), mi.Float(roughness)
         dr.enable_grad(inputs)
         values = shading.shade(*inputs[:3], inputs[4], inputs[3])

@@ -64,4 +64,4 @@ def test_the_mean_above_zero_of_a_normal_variable_keeps_its_digits():
     t = np.abs(x)
     tail = np.exp(-0.5 * t**2) / np.sqrt(2 * np.pi) * (1 - t * np.sqrt(np.pi / 2) * erfcx(t / np.sqrt(2)))
     exact = np.maximum(x, 0.0) + tail
-    np.testing.assert_allclose(integrals._clamped_mean(mi.Float(x)).numpy(), exact, rtol=5e-6)
+    np.testing.assert_allclose(integrals.clamped_mean(mi.Float(x)).numpy(), exact, rtol=5e-6)

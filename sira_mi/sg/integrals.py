@@ -62,7 +62,7 @@ def _normal_density(x):
     return dr.exp(-0.5 * dr.square(x)) * (1.0 / math.sqrt(2.0 * math.pi))
 
 
-def _clamped_mean(x):
+def clamped_mean(x: "mi.Float") -> "mi.Float":
     """E max(x + N(0, 1), 0) = x Φ(x) + φ(x), to a relative error of 1e-6 for every x."""
     distance = dr.abs(x)
     y = dr.rcp(dr.fma(distance, _TAIL_SCALE, 1.0))
@@ -137,4 +137,4 @@ def cosine_integral(cosine: "mi.Float", sharpness: "mi.Float") -> "mi.Float":
     mean = variance * sharpness * cosine
     ratio = _even_polynomial(cosine, sharpness, _COSINE_HALF_POINT, _COSINE_DEVIATION)
     deviation = dr.sqrt(variance * ratio)
-    return sphere_integral(sharpness) * deviation * _clamped_mean(mean / deviation)
+    return sphere_integral(sharpness) * deviation * clamped_mean(mean / deviation)

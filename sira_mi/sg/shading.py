@@ -121,18 +121,18 @@ def _point_gradient(point, packed, count, gradient):
 def _lobe_gradient(point, packed, count, gradient):
     """Adjoint of `_sum_over_lobes` in the flat lobe array, the same bits on every run.
 
-    Lane (lobe, chunk) loops over every `chunks`-th point, and the chunks are then added by a block reduction: each sum
-    has one fixed order, unlike a scatter-add from several threads."""
+    Lane (chunk, lobe) loops over the chunk's points, and the chunks are then added by a block reduction: each sum has
+    one fixed order, unlike a scatter-add from several threads."""
     points = dr.width(*point, *gradient)
     chunks = -(-points // _POINTS_PER_LANE)
     lane = dr.arange(mi.UInt32, count * chunks)
-    lobe, chunk = lane // chunks, lane % chunks
+    chunk, lobe = lane // count, lane % count
     point = tuple(value + dr.zeros(type(value), points) for value in point)
     gradient = tuple(value + dr.zeros(type(value), points) for value in gradient)
     dr.eval(point, gradient)
 
     def body(step, *sums):
-        index = step * chunks + chunk
+        index = chunk * _POINTS_PER_LANE + step
         active = index < points
         here = SpecularLobes(*(dr.gather(type(value), value, index, active) for value in point))
         weights = [dr.gather(mi.Color3f, value, index, active) for value in gradient]
@@ -149,7 +149,11 @@ def _lobe_gradient(point, packed, count, gradient):
         body=body,
         labels=("step", "d_axis", "d_sharpness", "d_amplitude"),
     )
-    return dr.ravel(mi.ArrayXf([dr.block_sum(value, chunks) for value in (*axis, sharpness, *amplitude)]))
+    # In one launch; the block sum of what is not evaluated yet would run the loop for itself.
+    dr.eval(axis, sharpness, amplitude)
+    by_lobe = lane % chunks * count + lane // chunks
+    sums = [dr.block_sum(dr.gather(mi.Float, x, by_lobe), chunks) for x in (*axis, sharpness, *amplitude)]
+    return dr.ravel(mi.ArrayXf(sums))
 
 
 class _SumOverLobes(dr.CustomOp):

@@ -1,11 +1,18 @@
 """The specular reflectance at a shading point as lobes of light directions, and its integral against a light lobe.
 
-PhySG warps the normal distribution around the mirror direction and takes Fresnel and masking there; for rough surfaces
-seen at an angle the true integrand lies elsewhere and is wider. Here a lobe times the light's cosine has the integral
-over the hemisphere (within about 1%) and the mean direction of reflectance times cosine, from a table by view cosine
-and roughness. One lobe is too round for a light sharper than itself; the reflectance relative to the lobe, at the
-centre of the product with the light, corrects it in proportion to w = (λ_light / (λ_light + λ_lobe))². Broad lights
-keep their energy, and for sharp ones the result tends to reflectance × irradiance.
+PhySG warps the normal distribution to one round lobe around the mirror direction. The reflectance times the light's
+cosine is longer than wide, is cut off at the horizon and, for rough surfaces seen at an angle, lies elsewhere. Here it
+is, in two parts (F = s + (1 − s) P, for F = 1 and for F = P), a lobe that is sharper across the plane of incidence,
+
+    L(ω) = μ exp(ν (ω·a − 1) − κ (ω·b)²) (ω·n)₊,   b = n × v,
+
+with the part's exact integral over the hemisphere; axis a, sharpness ν and κ are tabulated by view cosine and
+roughness. Against a light lobe the product of the round factors is again a lobe. For a direction drawn from it, ω·b and
+ω·n have exactly known means; taking them as normally distributed gives the integral of both other factors.
+
+A light sharper than the reflectance sees its true shape: the result is multiplied by (f^s / L)^w, with f^s and L at the
+mean direction of the integrand and w = (λ / (λ + τ))², τ tabulated too. So the energy is right under broad lights, and
+under sharp ones the result tends to f^s × irradiance.
 """
 
 import math
@@ -15,37 +22,52 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.sg import brdf, specular_table
-from sira_mi.sg.integrals import cosine_integral, product
+from sira_mi.sg.integrals import clamped_mean, mean_over_sharpness, product, sphere_integral
 
-# Range of the roughness in the tables.
-_MINIMUM_ROUGHNESS = 0.2
-_MAXIMUM_ROUGHNESS = 1.0
+# Range of the roughness in the tables; below it they scale with the width of the normal distribution.
+MINIMUM_ROUGHNESS = 0.1
+MAXIMUM_ROUGHNESS = 1.0
 # A view below this cosine is shaded as if at it.
 _MINIMUM_VIEW_COSINE = 1e-3
+# How far from grazing a view is, by its cosine c: in the tables c (1 + x r²) / (c + x r²), and for the mean cosine of
+# view and half vectors √(c² + x r⁴).
+_TABLE_GRAZING, _MEAN_GRAZING = 2.0, 0.2
+# Share of the variance along a lobe's axis that is left out; some must remain for its root to be differentiable.
+_AXIAL = 0.99
 # Bound of the log of the reflectance relative to its lobe; reached far out in the tails only.
 _MAXIMUM_CORRECTION = 6.0
-_TABLES = {
-    "white": (specular_table.WHITE_ENERGY, specular_table.WHITE_TURN, specular_table.WHITE_SHARPNESS),
-    "grazing": (specular_table.GRAZING_ENERGY, specular_table.GRAZING_TURN, specular_table.GRAZING_SHARPNESS),
-}
+# Log amplitude of no light.
+_DARK = -1e4
+
+
+class LobeShape(NamedTuple):
+    """What is tabulated of a shading point; see `specular_table.py`."""
+
+    white_energy: "mi.Float"
+    white_turn: "mi.Float"
+    white_sharpness: "mi.Float"
+    grazing_energy: "mi.Float"
+    grazing_turn: "mi.Float"
+    grazing_sharpness: "mi.Float"
+    across: "mi.Float"
+    half_point: "mi.Float"
 
 
 class SpecularLobes(NamedTuple):
-    """What the integral against a light lobe needs of a shading point; F = s + (1 − s) P weights the two parts.
-
-    A ratio is the log of the reflectance's constant factors relative to the lobe's amplitude."""
+    """What the integral against a light lobe needs of a shading point: for F = 1 (white) and for F = P (grazing) the
+    round factor of the lobe, for both its sharpness κ across the plane of incidence and the half point τ."""
 
     normal: "mi.Vector3f"
     view: "mi.Vector3f"
     roughness: "mi.Float"
+    across: "mi.Float"
+    half_point: "mi.Float"
     white_axis: "mi.Vector3f"
     white_sharpness: "mi.Float"
-    white_amplitude: "mi.Float"
-    white_ratio: "mi.Float"
+    white_log_amplitude: "mi.Float"
     grazing_axis: "mi.Vector3f"
     grazing_sharpness: "mi.Float"
-    grazing_amplitude: "mi.Float"
-    grazing_ratio: "mi.Float"
+    grazing_log_amplitude: "mi.Float"
 
 
 def _chebyshev(x, count):
@@ -55,30 +77,75 @@ def _chebyshev(x, count):
     return values
 
 
-def _evaluate_table(table, cosine_terms, roughness_terms):
-    rows = [sum(a * t for a, t in zip(row, roughness_terms, strict=True)) for row in table]
-    return sum(row * t for row, t in zip(rows, cosine_terms, strict=True))
+def table_variables(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Float", "mi.Float"]:
+    """The variables of the tables, each from −1 to 1, at a view cosine and a roughness."""
+    scale = _TABLE_GRAZING * dr.square(roughness)
+    within = dr.clip(roughness, MINIMUM_ROUGHNESS, MAXIMUM_ROUGHNESS)
+    middle, half_span = 0.5 * (MAXIMUM_ROUGHNESS + MINIMUM_ROUGHNESS), 0.5 * (MAXIMUM_ROUGHNESS - MINIMUM_ROUGHNESS)
+    grazing = 2.0 * cosine * (1.0 + scale) / (cosine + scale) - 1.0
+    return grazing, (within - middle) * (1.0 / half_span)
+
+
+def tabulated_shape(cosine: "mi.Float", roughness: "mi.Float") -> LobeShape:
+    """The tables at a view cosine in (0, 1] and a roughness."""
+    variables = table_variables(cosine, roughness)
+    cosine_terms, roughness_terms = (
+        _chebyshev(x, count) for x, count in zip(variables, specular_table.TERMS, strict=True)
+    )
+    values = []
+    for name in LobeShape._fields:
+        table = getattr(specular_table, name.upper())
+        rows = [sum(a * t for a, t in zip(row, roughness_terms, strict=True)) for row in table]
+        values.append(sum(row * t for row, t in zip(rows, cosine_terms, strict=True)))
+    return LobeShape(*values)
+
+
+def mean_half_cosine(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
+    """About the mean cosine of view and half vectors, which stays away from 0 at grazing views."""
+    return dr.sqrt(dr.square(cosine) + _MEAN_GRAZING * dr.square(dr.square(roughness)))
+
+
+def log_energy(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Float", "mi.Float"]:
+    """Log of about ∫ f^s (ω·n)₊ dω over the hemisphere for F = 1 and F = P, the limit for small roughness."""
+    half = mean_half_cosine(cosine, roughness)
+    white = 2.0 * dr.log(half * brdf.visibility(half, roughness))
+    return white, white + brdf.log_fresnel_weight(half)
+
+
+def shaped_lobes(
+    normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float", shape: LobeShape, cosine: "mi.Float"
+) -> SpecularLobes:
+    """The lobes of a given shape, for a view of that `cosine` above the surface."""
+    sharpness = 0.25 * brdf.distribution_sharpness(roughness)
+    mirror = 2.0 * cosine * normal - view
+    across = 0.5 * sharpness * dr.exp(shape.across) / dr.square(mean_half_cosine(cosine, roughness))
+    sine_square = dr.squared_norm(dr.cross(normal, view))
+    lobes = []
+    for part, energy in zip(("white", "grazing"), log_energy(cosine, roughness), strict=True):
+        energy, turn, scale = (
+            base + getattr(shape, f"{part}_{name}")
+            for base, name in ((energy, "energy"), (0.0, "turn"), (0.0, "sharpness"))
+        )
+        axis = dr.normalize(mirror + dr.square(roughness) * turn * (cosine * mirror - normal))
+        lobe_sharpness = sharpness * dr.exp(scale)
+        mean, deviation, ratio = _moments(dr.dot(normal, axis), lobe_sharpness)
+        unit = sphere_integral(lobe_sharpness) * deviation * clamped_mean(mean / deviation)
+        narrowing = 1.0 + 2.0 * across * ratio * sine_square
+        lobes += [axis, lobe_sharpness, energy - dr.log(unit) + 0.5 * dr.log(narrowing)]
+    return SpecularLobes(normal, view, mi.Float(roughness), across, sharpness * dr.exp(shape.half_point), *lobes)
 
 
 def specular_lobes(normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float") -> SpecularLobes:
-    """The two lobes at a shading point with unit `normal` and `view`; amplitude 0 where the view is below."""
+    """The two lobes at a shading point with unit `normal` and `view`; dark where the view is below the surface."""
     cosine = dr.dot(normal, view)
-    above = cosine > 0.0
-    cosine = dr.clip(cosine, _MINIMUM_VIEW_COSINE, 1.0)
-    tabulated = dr.clip(roughness, _MINIMUM_ROUGHNESS, _MAXIMUM_ROUGHNESS)
-    cosine_terms = _chebyshev(2.0 * cosine - 1.0, 8)
-    roughness_terms = _chebyshev((tabulated - 0.6) / 0.4, 6)
-    mirror = 2.0 * cosine * normal - view
-    base = brdf.distribution_sharpness(roughness) / (2.0 + 2.0 * dr.square(cosine))
-    factor = brdf.distribution_sharpness(roughness) * (0.125 / math.pi) * brdf.visibility(cosine, roughness)
-    lobes = []
-    for tables in _TABLES.values():
-        energy, turn, sharpness = (_evaluate_table(table, cosine_terms, roughness_terms) for table in tables)
-        axis = dr.normalize(mirror + turn * (cosine * mirror - normal))
-        sharpness = base * dr.exp(sharpness)
-        amplitude = dr.exp(energy) / cosine_integral(dr.dot(normal, axis), sharpness)
-        lobes += [axis, sharpness, dr.select(above, amplitude, 0.0), dr.log(factor / amplitude)]
-    return SpecularLobes(normal, view, mi.Float(roughness), *lobes)
+    clipped = dr.clip(cosine, _MINIMUM_VIEW_COSINE, 1.0)
+    roughness = mi.Float(roughness)
+    lobes = shaped_lobes(normal, view, roughness, tabulated_shape(clipped, roughness), clipped)
+    white, grazing = (
+        dr.select(cosine > 0.0, amplitude, _DARK)
+        for amplitude in (lobes.white_log_amplitude, lobes.grazing_log_amplitude)
+    )
+    return lobes._replace(white_log_amplitude=white, grazing_log_amplitude=grazing)
 
 
 def specular_integrals(
@@ -89,19 +156,44 @@ def specular_integrals(
     return white, _integral(lobes, "grazing", axis, sharpness)
 
 
+def _moments(cosine, sharpness):
+    """Mean and deviation of ω·n for a direction drawn from a lobe with ξ·n = `cosine`, and the mean over ξ·n λ.
+
+    The variance along the axis, exactly 1 − A² − 2A/λ, is that across it, A/λ, times about (λ + 4) / (λ² + λ + 4)."""
+    ratio = mean_over_sharpness(sharpness)
+    square = dr.square(sharpness)
+    along = _AXIAL * square / (square + sharpness + 4.0)
+    return ratio * sharpness * cosine, dr.sqrt(ratio * (1.0 - along * dr.square(cosine))), ratio
+
+
 def _integral(lobes, part, axis, sharpness):
-    lobe_axis, lobe_sharpness, amplitude, ratio = (
-        getattr(lobes, f"{part}_{name}") for name in ("axis", "sharpness", "amplitude", "ratio")
+    lobe_axis, lobe_sharpness, lobe_amplitude = (
+        getattr(lobes, f"{part}_{name}") for name in ("axis", "sharpness", "log_amplitude")
     )
-    joint_axis, joint_sharpness, log_amplitude = product(lobe_axis, lobe_sharpness, axis, sharpness)
-    cosine = dr.dot(lobes.normal, joint_axis)
-    half = joint_axis + lobes.view
+    normal, view, roughness = lobes.normal, lobes.view, lobes.roughness
+    joint_axis, joint_sharpness, exponent = product(lobe_axis, lobe_sharpness, axis, sharpness)
+    mean, deviation, ratio = _moments(dr.dot(normal, joint_axis), joint_sharpness)
+    across = dr.cross(normal, view)
+    offset = ratio * joint_sharpness * dr.dot(across, joint_axis)
+    narrowing = 1.0 + 2.0 * lobes.across * ratio * dr.squared_norm(across)
+    pull = lobes.across * offset / narrowing
+    # The mean of a normally distributed cosine that is weighed by its positive part, ½ (m + √(m² + 2π s²)).
+    spread = math.pi * dr.square(deviation)
+    cosine = dr.maximum(mean, 0.0) + spread / (dr.sqrt(dr.square(mean) + 2.0 * spread) + dr.abs(mean))
+    centre = ratio * joint_sharpness * joint_axis - 2.0 * ratio * pull * across + (cosine - mean) * normal
+    centre *= dr.rsqrt(dr.squared_norm(centre) + 1e-12)
+    half = centre + view
     half *= dr.rsqrt(dr.squared_norm(half) + 1e-12)
-    ratio = ratio + dr.log(brdf.visibility(dr.maximum(cosine, 0.0), lobes.roughness))
-    ratio += 0.5 * lobe_sharpness * dr.squared_norm(joint_axis - lobe_axis)
-    ratio -= 0.5 * brdf.distribution_sharpness(lobes.roughness) * dr.squared_norm(half - lobes.normal)
+    distribution = brdf.distribution_sharpness(roughness)
+    masking = brdf.visibility(dr.maximum(dr.dot(normal, view), 0.0), roughness)
+    masking *= brdf.visibility(dr.maximum(dr.dot(normal, centre), 0.0), roughness)
+    reflectance = dr.log(distribution * (0.125 / math.pi) * masking)
+    reflectance -= 0.5 * distribution * dr.squared_norm(half - normal)
     if part == "grazing":
-        ratio += brdf.log_fresnel_weight(dr.dot(lobes.view, half))
-    weight = dr.square(sharpness / (sharpness + lobe_sharpness))
-    correction = weight * dr.clip(ratio, -_MAXIMUM_CORRECTION, _MAXIMUM_CORRECTION)
-    return amplitude * dr.exp(log_amplitude + correction) * cosine_integral(cosine, joint_sharpness)
+        reflectance += brdf.log_fresnel_weight(dr.dot(view, half))
+    lobe = lobe_amplitude - 0.5 * lobe_sharpness * dr.squared_norm(centre - lobe_axis)
+    lobe -= lobes.across * dr.square(dr.dot(across, centre))
+    weight = dr.square(sharpness / (sharpness + lobes.half_point))
+    correction = weight * dr.clip(reflectance - lobe, -_MAXIMUM_CORRECTION, _MAXIMUM_CORRECTION)
+    flux = sphere_integral(joint_sharpness) * deviation * clamped_mean(mean / deviation) * dr.rsqrt(narrowing)
+    return flux * dr.exp(lobe_amplitude + exponent - pull * offset + correction)
