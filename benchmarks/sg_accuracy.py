@@ -132,7 +132,7 @@ def specular_table(nodes: int) -> None:
     """Prints the errors of the specular closed forms."""
     from sira_mi.sg import shading
 
-    print("Specular: largest error over light directions, % of the largest value, PhySG → this project")
+    print("\nSpecular: largest error over light directions, % of the largest value, PhySG → this project")
     print("| roughness | albedo | view | " + " | ".join(f"λ = {x:g}" for x in SHARPNESSES) + " |")
     print("|---" * (3 + len(SHARPNESSES)) + "|")
     worst = {}
