@@ -276,6 +276,23 @@ def test_gradients_match_differences(which):
     assert (gradients(*wrap(values))[index] * direction).sum() == pytest.approx(difference, rel=1e-3)
 
 
+def test_roughness_gradient_matches_differences():
+    """Through the tables too: grazing views, and roughness from 0.15 to 0.9."""
+    normal, view = random_points(64, 9, lowest=0.05)
+    packed = mi.TensorXf(lobes.initial_lobes(8))
+    roughness = np.linspace(0.15, 0.9, 64)
+
+    def specular(value):
+        return dr.sum(shading.shade(mi.Vector3f(normal), mi.Vector3f(view), mi.Float(0.2), value, packed)[1])
+
+    value, step = mi.Float(roughness), 1e-3
+    dr.enable_grad(value)
+    dr.backward(specular(value))
+    above, below = (specular(mi.Float(roughness + sign * step)).numpy() for sign in (1, -1))
+    difference = (above - below) / (2 * step)
+    np.testing.assert_allclose(dr.grad(value).numpy(), difference, rtol=2e-2, atol=2e-3 * np.abs(difference).max())
+
+
 def wrap(values):
     normal, view, albedo, set_of_lobes = values
     return mi.Vector3f(normal), mi.Vector3f(view), mi.Float(albedo), set_of_lobes.astype(np.float32)
