@@ -3,11 +3,14 @@
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
 # isort: split
+import dataclasses
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from sira_mi.fields.mlp import Architecture, initial_parameters
+from sira_mi.fit.settings import QUALITIES, FitSettings
 from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
 from sira_mi.portrait.camera import Camera
 
@@ -39,6 +42,23 @@ SMALL = AvatarArchitecture(
     illumination_depth=2,
     illumination_latent=4,
 )
+
+
+@pytest.fixture(scope="module")
+def variant():
+    """The variant of these tests, and afterwards the one that was set before."""
+    previous = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    yield
+    if previous:
+        mi.set_variant(previous)
+
+
+def tiny_fit(steps: int) -> FitSettings:
+    """A fit of `steps` steps a stage: every stage and every file is real, only too short to look good."""
+    stages = tuple((kind, dataclasses.replace(stage, steps=steps)) for kind, stage in QUALITIES["draft"].stages)
+    sizes = {"working_size": 128, "rays": 256, "points": 64, "pixels": 256, "voxel": 0.16, "final_voxel": 0.12}
+    return FitSettings("tiny", **sizes, stages=stages, block=3)
 
 
 def even_directions(count: int) -> np.ndarray:

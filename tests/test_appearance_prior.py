@@ -12,7 +12,7 @@ from conftest import SMALL, small_avatar
 
 from sira_mi.conventions import HELD_OUT_VIEWS, LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate import appearance_prior as ap
+from sira_mi.evaluate.priors import appearance_prior as ap
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -19,9 +18,9 @@ from sira_mi.collection.render import Part, RenderSettings, build_scene, project
 from sira_mi.collection.sources.makehuman import MakeHumanSource
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate import benchmark
-from sira_mi.evaluate.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
-from sira_mi.evaluate.benchmark_plan import (
+from sira_mi.evaluate.portraits import benchmark
+from sira_mi.evaluate.portraits.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
+from sira_mi.evaluate.portraits.benchmark_plan import (
     BenchmarkSettings,
     Identity,
     choose_identities,
@@ -29,8 +28,8 @@ from sira_mi.evaluate.benchmark_plan import (
     named_sources,
     plan,
 )
-from sira_mi.evaluate.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
-from sira_mi.evaluate.truth import load_truth
+from sira_mi.evaluate.portraits.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
+from sira_mi.evaluate.portraits.truth import load_truth
 from sira_mi.portrait.camera import focal_from_exif
 from sira_mi.portrait.load import linear_to_srgb, load_photo
 
@@ -39,13 +38,7 @@ EVEN = {code: 0.5 for code in range(4)}
 NUMBER, SEED = 7, 4711
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    previous = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    if previous:
-        mi.set_variant(previous)
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def ball(radius: float, centre: tuple, albedo: tuple, specular: float, code: int) -> Part:

@@ -6,7 +6,6 @@ import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 import json
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -21,15 +20,6 @@ from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMI
 from sira_mi.errors import InputError
 
 SMALL = scene.SceneSettings(points=1500, volume=1200, render=render.RenderSettings(size=48, samples=4))
-
-
-@pytest.fixture(scope="module")
-def variant():
-    previous = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    if previous:
-        mi.set_variant(previous)
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,10 @@ from test_training import SIZES, ball_collection
 from sira_mi import train
 from sira_mi.errors import InputError
 from sira_mi.evaluate import __main__ as command
-from sira_mi.evaluate import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
-from sira_mi.evaluate.appearance_prior import LatentFit
 from sira_mi.evaluate.cache import cached, fingerprint, read
-from sira_mi.evaluate.shape_prior import Scan, ShapeFit
+from sira_mi.evaluate.priors import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
+from sira_mi.evaluate.priors.appearance_prior import LatentFit
+from sira_mi.evaluate.priors.shape_prior import Scan, ShapeFit
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface

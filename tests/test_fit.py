@@ -1,6 +1,5 @@
 """The fit as a user runs it: what it leaves behind, resume to the same result, interrupts, bad input."""
 
-import dataclasses
 import json
 import os
 import subprocess
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import skimage.data
 import trimesh
+from conftest import tiny_fit
 from PIL import Image
 
 from sira_mi.errors import InputError
@@ -20,18 +20,7 @@ from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_
 from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.portrait.camera import Camera
 
-# A fit of a few steps a stage: every stage and every file is real, only too short to look good.
-TINY = fit_settings.FitSettings(
-    quality="tiny",
-    working_size=128,
-    rays=256,
-    points=64,
-    pixels=256,
-    voxel=0.16,
-    final_voxel=0.12,
-    stages=tuple((kind, dataclasses.replace(stage, steps=6)) for kind, stage in fit_settings.QUALITIES["draft"].stages),
-    block=3,
-)
+TINY = tiny_fit(steps=6)
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import skimage.data
+from conftest import tiny_fit
 from PIL import Image
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate import fits, results_page, run_methods
-from sira_mi.evaluate.methods import BY_NAME, METHODS
-from sira_mi.evaluate.run_methods import Job, run
+from sira_mi.evaluate.portraits import fits, results_page, run_methods
+from sira_mi.evaluate.portraits.methods import BY_NAME, METHODS
+from sira_mi.evaluate.portraits.run_methods import Job, run
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, RELIEF
 from sira_mi.models.avatar import PRIOR, load_avatar
@@ -63,17 +64,7 @@ def photo(tmp_path_factory):
     return path
 
 
-TINY = dataclasses.replace(
-    DRAFT,
-    working_size=128,
-    rays=256,
-    points=64,
-    pixels=256,
-    voxel=0.16,
-    final_voxel=0.12,
-    block=3,
-    stages=tuple((kind, dataclasses.replace(stage, steps=3)) for kind, stage in DRAFT.stages),
-)
+TINY = tiny_fit(steps=3)
 
 
 @pytest.fixture(scope="module")

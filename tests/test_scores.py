@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from sira_mi.collection.annotation import Similarity
 from sira_mi.errors import InputError
-from sira_mi.evaluate.alignment import SIX_LANDMARKS, Icp, distances_from, icp, inverse
-from sira_mi.evaluate.appearance_scores import PredictedAppearance, score_appearance
-from sira_mi.evaluate.geometry_scores import (
+from sira_mi.evaluate.portraits.alignment import SIX_LANDMARKS, Icp, distances_from, icp, inverse
+from sira_mi.evaluate.portraits.appearance_scores import PredictedAppearance, score_appearance
+from sira_mi.evaluate.portraits.geometry_scores import (
     GeometrySettings,
     PredictedHead,
     score_geometry,
@@ -20,9 +20,9 @@ from sira_mi.evaluate.geometry_scores import (
     silhouette_iou,
     true_surface,
 )
-from sira_mi.evaluate.surface_distance import TriangleTree, nearest_reference
-from sira_mi.evaluate.truth import Truth, load_truth
-from sira_mi.evaluate.visible_surface import even_samples, mesh_images, outer_surface
+from sira_mi.evaluate.portraits.surface_distance import TriangleTree, nearest_reference
+from sira_mi.evaluate.portraits.truth import Truth, load_truth
+from sira_mi.evaluate.portraits.visible_surface import even_samples, mesh_images, outer_surface
 from sira_mi.portrait.camera import Camera
 
 QUICK = GeometrySettings(samples=4000, icp_points=1500)

@@ -7,7 +7,6 @@ import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 import pickle
 from dataclasses import replace
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
@@ -31,13 +30,7 @@ from sira_mi.errors import InputError
 SEED = 5000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def variant():
-    previous = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    if previous:
-        mi.set_variant(previous)
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture(scope="module")

@@ -96,6 +96,12 @@ def mitsuba_mesh(name: str, part: Part) -> mi.Mesh:
         "full": disney(1.0),
     }
     props["bsdf"] = mi.load_dict({"type": "twosided", "inner": bsdf})
+    return mesh_of(name, part, props)
+
+
+def mesh_of(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
+    """A Mitsuba mesh of a part's surface with the attributes `vertex_albedo` and `vertex_specular`; `props` holds its
+    BSDF."""
     mesh = mi.Mesh(name, len(part.vertices), len(part.triangles), has_vertex_normals=True, props=props)
     mesh.add_attribute("vertex_albedo", 3, part.albedo.astype(np.float32).ravel())
     mesh.add_attribute("vertex_specular", 1, part.specular.astype(np.float32).ravel())

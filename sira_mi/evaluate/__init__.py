@@ -1,1 +1,1 @@
-"""Evidence: how good the priors are, measured on heads that they have not seen."""
+"""How good the priors (`priors`) and the fits (`portraits`) are."""

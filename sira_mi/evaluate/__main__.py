@@ -59,10 +59,10 @@ def main() -> None:
         raise InputError("a number of steps is 0 (train nothing) or more")
     mi.set_variant(arguments.variant)
 
-    from sira_mi.evaluate.ablations import run_ablations, run_sizes
-    from sira_mi.evaluate.appearance_evidence import measure_appearance_prior, run_appearance_ablations
-    from sira_mi.evaluate.prior_page import write_page
-    from sira_mi.evaluate.shape_evidence import measure_shape_prior
+    from sira_mi.evaluate.priors.ablations import run_ablations, run_sizes
+    from sira_mi.evaluate.priors.appearance_evidence import measure_appearance_prior, run_appearance_ablations
+    from sira_mi.evaluate.priors.prior_page import write_page
+    from sira_mi.evaluate.priors.shape_evidence import measure_shape_prior
 
     evidence = arguments.runs / "evidence"
     start = time.monotonic()
@@ -81,9 +81,9 @@ def main() -> None:
 def compare_fits(arguments: argparse.Namespace) -> None:
     """Fits and scores the benchmark's portraits as the command line says, and writes the page."""
     mi.set_variant(arguments.variant)
-    from sira_mi.evaluate.fits import Comparison, compare, write_rows
-    from sira_mi.evaluate.methods import BY_NAME
-    from sira_mi.evaluate.results_page import write_results
+    from sira_mi.evaluate.portraits.fits import Comparison, compare, write_rows
+    from sira_mi.evaluate.portraits.methods import BY_NAME
+    from sira_mi.evaluate.portraits.results_page import write_results
     from sira_mi.models.avatar import PRIOR
 
     comparison = Comparison(
@@ -105,8 +105,8 @@ def compare_fits(arguments: argparse.Namespace) -> None:
 
 def make_benchmark(arguments: argparse.Namespace) -> None:
     """Builds the benchmark that the command line describes and prints what it holds."""
-    from sira_mi.evaluate.benchmark import build_benchmark
-    from sira_mi.evaluate.benchmark_plan import BenchmarkSettings, named_sources
+    from sira_mi.evaluate.portraits.benchmark import build_benchmark
+    from sira_mi.evaluate.portraits.benchmark_plan import BenchmarkSettings, named_sources
 
     if arguments.workers < 1:
         raise InputError("--workers must be at least 1")

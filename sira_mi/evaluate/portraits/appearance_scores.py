@@ -15,7 +15,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 
 from sira_mi.collection.skin import SKIN
 from sira_mi.evaluate.measures import F0_OF_STRENGTH, channel_scaled, correlation, luminance, psnr, ssim_inside
-from sira_mi.evaluate.truth import Truth, check_array
+from sira_mi.evaluate.portraits.truth import Truth, check_array
 from sira_mi.portrait.load import linear_to_srgb
 
 _EDGE = np.ones((3, 3), bool)  # what is eroded: a pixel, its sides and corners

@@ -11,13 +11,14 @@ import numpy as np
 from tqdm import tqdm
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate.appearance_scores import PredictedAppearance, score_appearance
-from sira_mi.evaluate.benchmark import read_benchmark
 from sira_mi.evaluate.cache import cached, fingerprint
-from sira_mi.evaluate.geometry_scores import PredictedHead, score_geometry, true_surface
-from sira_mi.evaluate.methods import BY_NAME, METHODS
-from sira_mi.evaluate.run_methods import Job, run
-from sira_mi.evaluate.truth import Truth, load_truth
+from sira_mi.evaluate.portraits.appearance_scores import PredictedAppearance, score_appearance
+from sira_mi.evaluate.portraits.benchmark import read_benchmark
+from sira_mi.evaluate.portraits.geometry_scores import PredictedHead, score_geometry, true_surface
+from sira_mi.evaluate.portraits.methods import BY_NAME, METHODS
+from sira_mi.evaluate.portraits.run_methods import Job, run
+from sira_mi.evaluate.portraits.truth import Truth, load_truth
+from sira_mi.files import write_through
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.portrait.camera import Camera
@@ -138,4 +139,5 @@ def _read_head(out: Path, shaded: bool, truth: Truth) -> tuple[PredictedHead, Pr
 
 def write_rows(path: Path, rows: list[dict]) -> None:
     """The rows as JSON, for the page and for other tools."""
-    path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    text = json.dumps(rows, indent=1) + "\n"
+    write_through(path, lambda file: file.write_text(text, encoding="utf-8"))

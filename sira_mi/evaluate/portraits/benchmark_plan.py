@@ -15,10 +15,10 @@ from sira_mi.collection.skin import CLOTH, HAIR, SKIN
 from sira_mi.collection.subject import Source
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate.benchmark_lights import EXTREMES, LIGHTS
-from sira_mi.evaluate.benchmark_portraits import PhotoSettings
 from sira_mi.evaluate.cache import fingerprint
-from sira_mi.evaluate.shape_prior import manifest_entries
+from sira_mi.evaluate.portraits.benchmark_lights import EXTREMES, LIGHTS
+from sira_mi.evaluate.portraits.benchmark_portraits import PhotoSettings
+from sira_mi.evaluate.priors.shape_prior import manifest_entries
 
 FORMAT = "sira-mi benchmark 1"
 # Identities are drawn from the sources in these proportions, as far as there are test heads.

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from sira_mi.collection.render import Part, intrinsic_matrix, look_at
+from sira_mi.collection.render import Part, intrinsic_matrix, look_at, mesh_of
 from sira_mi.collection.skin import CLOTH, EYE, HAIR, SKIN
 from sira_mi.conventions import LUMINANCE
 
@@ -71,17 +71,10 @@ def principled_mesh(name: str, part: Part, strength: float, roughness: dict[int,
             "specular": strength,
         }
     )
-    mesh = mi.Mesh(name, len(part.vertices), len(part.triangles), has_vertex_normals=True, props=props)
+    mesh = mesh_of(name, part, props)
     rough = np.array([roughness[code] for code in range(len(roughness))])[part.region]
-    mesh.add_attribute("vertex_albedo", 3, part.albedo.astype(np.float32).ravel())
-    mesh.add_attribute("vertex_specular", 1, part.specular.astype(np.float32).ravel())
     mesh.add_attribute("face_roughness", 1, rough.astype(np.float32))
     mesh.add_attribute("face_region", 1, part.region.astype(np.float32))
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = part.vertices.astype(np.float32).ravel()
-    params["vertex_normals"] = part.normals.astype(np.float32).ravel()
-    params["faces"] = part.triangles.astype(np.uint32).ravel()
-    params.update()
     return mesh
 
 

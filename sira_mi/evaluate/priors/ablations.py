@@ -16,9 +16,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.evaluate import shape_prior
 from sira_mi.evaluate.cache import cached, fingerprint
-from sira_mi.evaluate.shape_prior import Scan, ShapeFit
+from sira_mi.evaluate.priors import shape_prior
+from sira_mi.evaluate.priors.shape_prior import Scan, ShapeFit
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from sira_mi.errors import InputError
 from sira_mi.evaluate.cache import fingerprint
-from sira_mi.evaluate.methods import BY_NAME
+from sira_mi.evaluate.portraits.methods import BY_NAME
 from sira_mi.files import write_through
 from sira_mi.fit.settings import FitSettings
 
@@ -69,7 +69,7 @@ def _fit(job: Job) -> None:
     started = time.monotonic()
     result: dict = {"key": job.key()}
     try:
-        from sira_mi.evaluate.fitted_head import fit_and_write  # its plugins need the variant
+        from sira_mi.evaluate.portraits.fitted_head import fit_and_write  # its plugins need the variant
 
         result |= fit_and_write(job)
     except InputError as error:

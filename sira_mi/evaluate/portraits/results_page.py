@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from sira_mi.evaluate.fits import MEAN_HEAD
 from sira_mi.evaluate.markdown import number, table
-from sira_mi.evaluate.methods import BY_NAME
+from sira_mi.evaluate.portraits.fits import MEAN_HEAD
+from sira_mi.evaluate.portraits.methods import BY_NAME
 from sira_mi.files import write_png, write_through
 from sira_mi.fit import output
 

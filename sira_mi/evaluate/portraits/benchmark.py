@@ -25,8 +25,8 @@ from sira_mi.collection.skin import CLOTH
 from sira_mi.collection.subject import BrokenHead, Source, Subject
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate.benchmark_lights import BRIGHTEST, backdrop, light_map
-from sira_mi.evaluate.benchmark_plan import (
+from sira_mi.evaluate.portraits.benchmark_lights import BRIGHTEST, backdrop, light_map
+from sira_mi.evaluate.portraits.benchmark_plan import (
     FORMAT,
     BenchmarkSettings,
     Identity,
@@ -35,7 +35,7 @@ from sira_mi.evaluate.benchmark_plan import (
     held_out_heads,
     plan,
 )
-from sira_mi.evaluate.benchmark_portraits import NOTHING, PhotoSettings, View, draw_roughness, portrait_camera
+from sira_mi.evaluate.portraits.benchmark_portraits import NOTHING, PhotoSettings, View, draw_roughness, portrait_camera
 from sira_mi.files import write_through
 from sira_mi.portrait.load import linear_to_srgb
 

@@ -12,11 +12,11 @@ from time import monotonic
 import numpy as np
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate import appearance_prior as measures_of
-from sira_mi.evaluate.ablations import COMPLETE, read_model, seconds, training_scenes
-from sira_mi.evaluate.appearance_prior import HeldOut, LatentFit
 from sira_mi.evaluate.cache import cached, fingerprint, read
-from sira_mi.evaluate.shape_prior import manifest_entries
+from sira_mi.evaluate.priors import appearance_prior as measures_of
+from sira_mi.evaluate.priors.ablations import COMPLETE, read_model, seconds, training_scenes
+from sira_mi.evaluate.priors.appearance_prior import HeldOut, LatentFit
+from sira_mi.evaluate.priors.shape_prior import manifest_entries
 from sira_mi.files import write_png
 from sira_mi.models.af_sm import AppearanceTraining
 from sira_mi.models.avatar import Avatar, load_avatar

@@ -25,7 +25,8 @@ import numpy as np
 from sira_mi.collection.skin import EYE, SKIN
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.evaluate.alignment import (
+from sira_mi.evaluate.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statistics
+from sira_mi.evaluate.portraits.alignment import (
     Icp,
     camera_alignment,
     camera_scale,
@@ -35,10 +36,15 @@ from sira_mi.evaluate.alignment import (
     landmark_alignment,
     shared_landmarks,
 )
-from sira_mi.evaluate.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statistics
-from sira_mi.evaluate.surface_distance import TriangleTree
-from sira_mi.evaluate.truth import LANDMARKS, Truth, check_array, check_mesh
-from sira_mi.evaluate.visible_surface import MeshImages, OuterSurface, mesh_images, outer_surface, seen_by_camera
+from sira_mi.evaluate.portraits.surface_distance import TriangleTree
+from sira_mi.evaluate.portraits.truth import LANDMARKS, Truth, check_array, check_mesh
+from sira_mi.evaluate.portraits.visible_surface import (
+    MeshImages,
+    OuterSurface,
+    mesh_images,
+    outer_surface,
+    seen_by_camera,
+)
 from sira_mi.fit.rays import modelled_pixels
 from sira_mi.portrait.camera import Camera
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sira_mi.evaluate.cache import read
 from sira_mi.evaluate.markdown import average, number, percent, table
-from sira_mi.evaluate.shape_prior import DISC_RADIUS, REGIONS
+from sira_mi.evaluate.priors.shape_prior import DISC_RADIUS, REGIONS
 from sira_mi.files import write_through
 from sira_mi.models.avatar import AvatarArchitecture
 

@@ -10,7 +10,7 @@ import numpy as np
 from sira_mi.collection.outer import seen_from_afar
 from sira_mi.collection.render import blocked_towards
 from sira_mi.collection.surface import vertex_normals
-from sira_mi.evaluate.surface_distance import face_normals
+from sira_mi.evaluate.portraits.surface_distance import face_normals
 from sira_mi.portrait.camera import Camera
 
 _CLEARANCE = 2e-3  # scene units between a surface and the start of a ray that leaves it

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sira_mi.collection.annotation import Similarity
 from sira_mi.collection.registration import similarity
 from sira_mi.errors import InputError
-from sira_mi.evaluate.surface_distance import TriangleTree
+from sira_mi.evaluate.portraits.surface_distance import TriangleTree
 from sira_mi.portrait.camera import Camera
 
 # The landmarks of H3DS among the 468: inner corners of the right and the left eye, tip and base of the nose, right and

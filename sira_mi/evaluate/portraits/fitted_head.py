@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate.methods import BY_NAME, Method
-from sira_mi.evaluate.run_methods import Job
+from sira_mi.evaluate.portraits.methods import BY_NAME, Method
+from sira_mi.evaluate.portraits.run_methods import Job
 from sira_mi.files import write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress
@@ -88,7 +88,7 @@ def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settin
         "world_to_camera": camera.world_to_camera,
         **{f"image/{name}": image.astype(np.float32) for name, image in pictures.items()},
     }
-    write_through(out / "head.npz", lambda file: np.savez_compressed(file.open("wb"), **arrays))
+    write_through(out / "head.npz", lambda file: np.savez_compressed(file, **arrays))
 
 
 def _geometry_pictures(camera: Camera, head) -> dict[str, np.ndarray]:

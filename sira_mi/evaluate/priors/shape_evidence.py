@@ -10,10 +10,10 @@ from time import monotonic
 import numpy as np
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate import shape_prior
-from sira_mi.evaluate.ablations import mean_nose, read_model, seconds
 from sira_mi.evaluate.cache import cached, fingerprint
-from sira_mi.evaluate.shape_prior import Scan, ShapeFit
+from sira_mi.evaluate.priors import shape_prior
+from sira_mi.evaluate.priors.ablations import mean_nose, read_model, seconds
+from sira_mi.evaluate.priors.shape_prior import Scan, ShapeFit
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_png
 from sira_mi.models.avatar import load_avatar
