@@ -13,8 +13,6 @@ from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg import visibility
 
-# Height above the surface at which shadow rays start, in spacings of the grid that the mesh is extracted on.
-_OFFSET = 0.2
 # Rows of the columns that are computed at a hit, in order.
 _ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}
 
@@ -164,7 +162,7 @@ def open_directions(scene, head, x, normal, directions):
     [3, N] of the field: tensor [K, N] of 0 and 1, without gradients."""
     rotation = rotation_of(head.to_world)
     point = (head.to_world @ from_columns(dr.detach(x), mi.Point3f)).numpy()
-    offset = _OFFSET * head.voxel * scale_of(head.to_world)
+    offset = visibility.SHADOW_OFFSET * head.voxel * scale_of(head.to_world)
     normal = rotation @ dr.detach(normal).numpy()
     return mi.TensorXf(
         visibility.trace_open(scene, point, normal, directions.axis @ rotation.T, offset).astype(np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 from sira_mi.fields.appearance import albedo_refinement, refined_albedo
 from sira_mi.fields.sdf import in_three
 from sira_mi.fit.settings import FitSettings, Stage
-from sira_mi.fit.shaded import decoder, mean_albedo, photo_points, shade_points, skin_patches
+from sira_mi.fit.shaded import base_albedo, decoder, photo_points, shade_points, skin_patches
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar
 from sira_mi.portrait.portrait import Portrait
@@ -34,9 +34,9 @@ class AppearanceProblem:
             return {}
         self.refresh(tensors)
         index = self._draw(np.random.default_rng(0))
-        shading = shade_points(self.avatar, self._fixed, 0.0, self.points[index], self._bounce)
-        rendered = (shading.albedo * shading.received).numpy()
-        factor = self.target[:, index].mean() / max(float(rendered.mean()), 1e-6)
+        points = self.points[index]
+        shading = shade_points(self.avatar, self._fixed, 0.0, points, base_albedo(self.avatar, self._fixed, points))
+        factor = self.target[:, index].mean() / max(float(shading.diffuse.numpy().mean()), 1e-6)
         return {"illumination": exposed(self.avatar, tensors["illumination"], factor)}
 
     def _draw(self, rng: np.random.Generator) -> np.ndarray:
@@ -46,7 +46,6 @@ class AppearanceProblem:
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Makes arrays of all tensors, those that the stage holds fixed included."""
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
-        self._bounce = mean_albedo(self.avatar, self._fixed, self.points)
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights, a = self.settings.appearance, self.avatar.architecture
@@ -56,34 +55,36 @@ class AppearanceProblem:
 
         share = step / max(stage.steps - 1, 1)
         k_s = stage.k_s[0] + (stage.k_s[1] - stage.k_s[0]) * min(1.0, 2 * share)
-        shading = shade_points(self.avatar, current, k_s, points, self._bounce)
+        base = albedo = base_albedo(self.avatar, current, points)
+        if stage.k_r > 0:
+            network = decoder(self.avatar, "albedo_refinement", current)
+            x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
+            fine = albedo_refinement(network, a.refinement_octaves, x_ref, gamma)
+            albedo = refined_albedo(base, fine, stage.k_r)
+        shading = shade_points(self.avatar, current, k_s, points, albedo)
+        target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
         terms = {
+            "color": losses.photometric_loss(shading.diffuse + shading.specular, target),
             "embedding": weights.embedding
             * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"])),
             "white_light": weights.white_light * _chroma(shading.lobes),
         }
         if self.skin is not None:
             terms["skin_tone"] = weights.skin_tone * self.skin.loss(self.avatar, current)
-        albedo = shading.albedo
         if stage.k_r > 0:
-            network = decoder(self.avatar, "albedo_refinement", current)
-            x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
-            fine = albedo_refinement(network, a.refinement_octaves, x_ref, gamma)
-            albedo = refined_albedo(albedo, fine, stage.k_r)
             moved = x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(index)))).astype(np.float32))
             rough = fine - albedo_refinement(network, a.refinement_octaves, moved, gamma)
-            terms["refinement"] = weights.refinement * self._refinement_loss(fine, shading)
+            base_diffuse = shading.diffuse * (base / dr.maximum(albedo, 1e-4))
+            terms["refinement"] = weights.refinement * self._refinement_loss(fine, base, base_diffuse, shading.specular)
             terms["smoothness"] = weights.smoothness * losses.mean(dr.abs(rough))
-        target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
-        terms["color"] = losses.photometric_loss(albedo * shading.received + shading.specular, target)
         return terms
 
-    def _refinement_loss(self, fine, shading):
+    def _refinement_loss(self, fine, base, base_diffuse, specular_radiance):
         """Eqs 12 and 13: ‖a^r‖ weighted by w, large in shadows and in reflections. The base albedo and the radiances
         only weigh, they are not moved by this loss."""
         weights = self.settings.appearance
-        shadow = dr.maximum(_norm_1(shading.albedo) - _norm_1(shading.albedo * shading.received), 0.0)
-        w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(shading.specular))
+        shadow = dr.maximum(_norm_1(base) - _norm_1(base_diffuse), 0.0)
+        w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(specular_radiance))
         length = dr.sqrt(dr.sum(fine * fine, axis=0) + 1e-8)
         return losses.mean(length * w)
 

@@ -10,7 +10,7 @@ import numpy as np
 from sira_mi.fields.sdf import normalised, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.fit.settings import FitSettings, Stage
-from sira_mi.fit.shaded import mean_albedo, photo_points, shade_points
+from sira_mi.fit.shaded import base_albedo, photo_points, shade_points
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar, signed_distance_field
 from sira_mi.portrait.portrait import Portrait
@@ -39,7 +39,6 @@ class ReliefProblem:
         self.points = photo_points(self.portrait, self.head)
         self.anchor = tensors["relief_anchor"]
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
-        self._bounce = mean_albedo(self.avatar, self._fixed, self.points)
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights = self.settings.relief
@@ -49,12 +48,13 @@ class ReliefProblem:
         points = self.points[_draw(rng, len(self.points.row), self.settings.pixels)]
         rays = (mi.TensorXf(v) for v in (points.origin, points.view, points.t))
         _, gradient, _, _ = surface(field, differentiable_hit(field, *rays))
-        shading = shade_points(self.avatar, current, stage.k_s[1], points, self._bounce, normalised(gradient))
+        albedo = base_albedo(self.avatar, current, points)
+        shading = shade_points(self.avatar, current, stage.k_s[1], points, albedo, normalised(gradient))
         target = mi.TensorXf(np.ascontiguousarray(self.portrait.image[points.row, points.column].T, np.float32))
         anchor = self.anchor[:, _draw(rng, self.anchor.shape[1], self.settings.points)]
         height, _, _, _ = surface(field, mi.TensorXf(np.ascontiguousarray(anchor)))
         return {
-            "color": losses.photometric_loss(shading.albedo * shading.received + shading.specular, target),
+            "color": losses.photometric_loss(shading.diffuse + shading.specular, target),
             "anchor": weights.anchor * losses.mean(dr.abs(height)),
             "eikonal": weights.eikonal * losses.eikonal_loss(gradient),
         }

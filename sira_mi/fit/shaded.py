@@ -11,18 +11,16 @@ from scipy.spatial import cKDTree
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
-from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
-from sira_mi.models.af_sm import AppearanceTraining
+from sira_mi.models.af_sm import AppearanceTraining, physical_radiance
 from sira_mi.models.avatar import Avatar
 from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.scene import sensor
-from sira_mi.sg.shading import shade
-from sira_mi.sg.visibility import arrival, even_directions, received, trace_open
+from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, even_directions, trace_open
 
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
@@ -78,7 +76,7 @@ def photo_points(portrait: Portrait, head) -> PhotoPoints:
     seen = seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
     scene = mi.load_dict({"type": "scene", "head": head})
     place = seen.origin + seen.t * seen.view
-    is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, 0.5 * head.voxel)
+    is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel)
     return PhotoPoints(**vars(seen), is_open=is_open)
 
 
@@ -132,36 +130,24 @@ class Shading:
     """Eq. 8 at some points: what the losses look at. Tensors."""
 
     lobes: mi.TensorXf  # [N_l, 7]
-    albedo: mi.TensorXf  # [3, N] base diffuse albedo
-    received: mi.TensorXf  # [3, N] irradiance / π, so that the diffuse radiance is the albedo times it
+    diffuse: mi.TensorXf  # [3, N] radiance
     specular: mi.TensorXf  # [3, N] radiance, times k_s
 
 
-def shade_points(
-    avatar: Avatar, tensors: dict, k_s: float, points: PhotoPoints, bounce_albedo: np.ndarray, normal=None
-) -> Shading:
-    """Albedos, light and radiance at `points` by the decoders at `tensors` (Floats); `normal` [3, N], a tensor, may
-    stand in for the points' own. Light counts where it arrives; where the head is in its way, one bounce off the head,
-    of diffuse albedo `bounce_albedo` [3], takes its place."""
-    a = avatar.architecture
-    x_ref, view = mi.TensorXf(points.x_ref), mi.TensorXf(points.view)
+def shade_points(avatar: Avatar, tensors: dict, k_s: float, points: PhotoPoints, albedo, normal=None) -> Shading:
+    """Light and radiance at `points` of diffuse `albedo` [3, N] by the decoders at `tensors` (Floats); `normal` [3, N],
+    a tensor, may stand in for the points' own. Light counts where it arrives, as in the `sira_sg` integrator."""
+    octaves = avatar.architecture.specular_octaves
+    view = mi.TensorXf(points.view)
     normal = mi.TensorXf(points.normal) if normal is None else normal
-    albedo = base_albedo(avatar, tensors, points)
-    specular = specular_albedo(decoder(avatar, "specular_albedo", tensors, "z_s"), a.specular_octaves, x_ref)
+    network = decoder(avatar, "specular_albedo", tensors, "z_s")
+    specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
     lobes = decode_lobes(avatar, tensors)
-    roughness = mi.Float(avatar.roughness)
-    irradiance, glossy = shade(
-        from_columns(normal, mi.Vector3f),
-        from_columns(-view, mi.Vector3f),
-        from_columns(specular, mi.Float),
-        roughness,
-        lobes,
-    )
     is_open = mi.TensorXf(points.is_open.astype(np.float32))
-    arrives = arrival(normal, -view, specular, roughness, lobes, even_directions(DIRECTIONS), is_open)
-    bounce = mi.TensorXf(np.repeat(bounce_albedo[:, None].astype(np.float32), len(points.row), axis=1))
-    irradiance, glossy = received(to_columns(irradiance), to_columns(glossy), arrives, bounce)
-    return Shading(lobes, albedo, irradiance * (1 / np.pi), glossy * k_s)
+    directions = even_directions(DIRECTIONS)
+    arrives = arrival(normal, -view, specular, mi.Float(avatar.roughness), lobes, directions, is_open)
+    radiance = physical_radiance(albedo, specular, normal, view, avatar.roughness, k_s, lobes, arrives)
+    return Shading(lobes, *radiance)
 
 
 def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):
@@ -169,11 +155,3 @@ def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):
     network = decoder(avatar, "diffuse_albedo", tensors, "z_a")
     octaves = avatar.architecture.albedo_octaves
     return diffuse_albedo(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma))
-
-
-def mean_albedo(avatar: Avatar, tensors: dict, points: PhotoPoints) -> np.ndarray:
-    """Mean base diffuse albedo [3] of the points."""
-    network = decoder(avatar, "diffuse_albedo", tensors, "z_a")
-    octaves = avatar.architecture.albedo_octaves
-    columns = evaluate_in_chunks(lambda x, g: diffuse_albedo(network, octaves, x, g), points.x_ref, points.gamma)
-    return columns[0].mean(axis=1)

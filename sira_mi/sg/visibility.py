@@ -32,6 +32,8 @@ from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions, lobe_count, unp
 _RESOLVED = 0.25
 # Share of the light's energy that is added to both sums of a ratio, which is then 1 where no light arrives.
 _FLOOR = 1e-6
+# Height above the surface at which shadow rays start, in spacings of the grid that the head's mesh is extracted on.
+SHADOW_OFFSET = 0.2
 # Rays of one launch.
 _LAUNCH = 1 << 22
 
