@@ -439,10 +439,9 @@ def test_sampled_crossings_lie_at_the_bisected_hits(avatar):
     origin, direction = rays_at_head(200)
     exact = exact_hits(field, origin, direction).numpy()
     early = np.random.default_rng(0).uniform(0.05, 0.15, exact.shape).astype(np.float32)
-    o, d = mi.TensorXf(origin), mi.TensorXf(direction)
-    found = tracing.first_crossings(field, o, d, mi.TensorXf(exact - early)).numpy()
+    found = tracing.first_crossings(field, origin, direction, exact - early)
     assert np.abs(found - exact).max() < 5e-3
-    away = tracing.first_crossings(field, o, mi.TensorXf(-direction), mi.TensorXf(exact)).numpy()
+    away = tracing.first_crossings(field, origin, -direction, exact)
     assert not (np.abs(away - exact) < 5).any()
 
 

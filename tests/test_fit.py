@@ -16,7 +16,7 @@ from PIL import Image
 from sira_mi.errors import InputError
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
-from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_camera, window_pixels
+from sira_mi.fit.rays import modelled_pixels, pixel_rays
 from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.portrait.camera import Camera
 
@@ -154,18 +154,6 @@ def _camera() -> Camera:
     world_to_camera = np.diag([1.0, -1, -1, 1])
     world_to_camera[2, 3] = 12
     return Camera(k, world_to_camera, 128, 96)
-
-
-def test_window_pixels_are_photo_pixels():
-    """A film pixel of a window's camera looks exactly where the photo pixel that it stands for does."""
-    camera = _camera()
-    window = window_around(10, 20, 100, 90, 12)
-    assert window.stride * window.size >= 90
-    columns, rows = window_pixels(window, (2, 1))
-    small = window_camera(camera, window, (2, 1))
-    _, expected = pixel_rays(camera, columns, rows)
-    _, found = pixel_rays(small, *np.meshgrid(np.arange(12), np.arange(12)))
-    assert np.allclose(expected, found, atol=1e-9)
 
 
 def test_modelled_pixels_leave_out_what_lies_below_the_floor():

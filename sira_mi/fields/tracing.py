@@ -12,7 +12,14 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, in_three, signed_distance, signed_distance_and_slope
+from sira_mi.fields.sdf import (
+    CHUNK,
+    SdfField,
+    evaluate_in_chunks,
+    in_three,
+    signed_distance,
+    signed_distance_and_slope,
+)
 
 # A hit counts as exact when |f| is below this many scene units: within 0.01 mm of the surface where the gradient has a
 # fifth of its typical length or more.
@@ -21,6 +28,8 @@ _MAXIMUM_STEP = 0.15
 _MINIMUM_SLOPE = 0.02
 # The search of `first_crossings`, in scene units along the ray from the proxy's hit.
 _SEARCH_START, _SEARCH_STEP, _SEARCH_SAMPLES = -0.24, 0.03, 64
+# Rays whose samples are evaluated at once.
+_SEARCH_RAYS = CHUNK // _SEARCH_SAMPLES
 _NO_CROSSING = 1e9
 # Where rays without a crossing are evaluated, scene units.
 _FAR = 1e4
@@ -56,23 +65,23 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = _ITERAT
         return t, f
 
 
-def first_crossings(field: SdfField, origin, direction, t):
-    """For rays that Newton steps did not bring onto the surface: the first change from outside to inside on even
+def first_crossings(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """For rays [3, N] that Newton steps did not bring onto the surface: the first change from outside to inside on even
     samples from a little before t [1, N] to well behind it, as a linear estimate [1, N]; `_NO_CROSSING` where there is
-    none.
-
-    Without gradients."""
-    with dr.suspend_grad():
-        found = dr.full(mi.TensorXf, _NO_CROSSING, t.shape)
-        before = dr.full(mi.TensorXf, -1.0, t.shape)
-        for k in range(_SEARCH_SAMPLES):
-            here = t + (_SEARCH_START + k * _SEARCH_STEP)
-            f = signed_distance(field, on_ray(origin, direction, here))
-            enters = (before > 0) & (f <= 0) & (found == _NO_CROSSING)
-            found = dr.select(enters, here - _SEARCH_STEP * f / (f - before), found)
-            before = f
-            dr.eval(found, before)
-        return found
+    none."""
+    at = t.T + np.float32(_SEARCH_START) + np.float32(_SEARCH_STEP) * np.arange(_SEARCH_SAMPLES, dtype=np.float32)
+    f = np.empty_like(at)
+    for first in range(0, len(at), _SEARCH_RAYS):
+        some = slice(first, first + _SEARCH_RAYS)
+        points = origin[:, some, None] + at[some] * direction[:, some, None]
+        (found,) = evaluate_in_chunks(lambda x: signed_distance(field, x), points.reshape(3, -1))
+        f[some] = found.reshape(-1, _SEARCH_SAMPLES)
+    enters = (f[:, :-1] > 0) & (f[:, 1:] <= 0)
+    ray, sample = np.arange(len(at)), enters.argmax(axis=1)
+    before, after = f[ray, sample], f[ray, sample + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = at[ray, sample] + np.float32(_SEARCH_STEP) * before / (before - after)
+    return np.where(enters.any(axis=1), crossing, np.float32(_NO_CROSSING))[None]
 
 
 def with_unit_gradient(field: SdfField, length: float) -> SdfField:
@@ -96,7 +105,7 @@ def refined_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: 
             break
         o, d, start = (c[:, stray] for c in (origin, direction, t if search else result[0]))
         if search:
-            (start,) = evaluate_in_chunks(lambda o, d, t: first_crossings(field, o, d, t), o, d, start)
+            start = first_crossings(field, o, d, start)
         for whole, part in zip(result, newton(o, d, np.minimum(start, _FAR)), strict=True):
             whole[:, stray] = part
     return result

@@ -1,7 +1,7 @@
 """The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF
 stays as it is. The head's pose, estimated from landmarks of the mean head, is optimised along.
 
-Colour and mask losses go through the `sira_radiance` integrator by `mi.render`; eikonal, landmark and regularising
+Colour and mask losses go through the `sira_radiance` integrator, one sample a ray; eikonal, landmark and regularising
 terms are evaluated on the field."""
 
 from dataclasses import replace
@@ -12,15 +12,15 @@ import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.errors import InputError
+from sira_mi.fields.columns import to_columns
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, rigid_motion, surface
-from sira_mi.fit.rays import modelled_pixels, window_around, window_camera, window_pixels
+from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar, signed_distance_field
 from sira_mi.portrait.camera import Camera, landmark_weights
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.scene import principal_point_offset, sensor
 
 _PARAMETERS = {
     "z_sdf": "head.z_sdf",
@@ -43,7 +43,7 @@ class GeometryProblem:
         size = round(settings.rays**0.5)
         self.valid = modelled_pixels(portrait.camera)
         self.windows = self._windows(size)
-        self.scene = mi.load_dict(self._description(avatar_path, size))
+        self.scene = mi.load_dict(self._description(avatar_path))
         self.head = self.scene.shapes()[0]
         self.parameters = mi.traverse(self.scene)
         self.head.remesh_every = 1 << 30
@@ -61,12 +61,9 @@ class GeometryProblem:
         reach = 0.15 * (high - low)
         return [window_around(*whole, size), window_around(*(low - reach), *(high + reach), size)]
 
-    def _description(self, avatar_path: str, size: int) -> dict:
-        camera = window_camera(self.portrait.camera, self.windows[0], (0, 0))
-        pixel_centres = {"type": "stratified", "sample_count": 1, "jitter": False}
+    def _description(self, avatar_path: str) -> dict:
         return {
             "type": "scene",
-            "sensor": sensor(camera, pixel_centres),
             "integrator": {"type": "sira_radiance", "avatar": avatar_path},
             "head": {"type": "neural_sdf", "avatar": avatar_path, "voxel": self.settings.voxel, "movable": True},
         }
@@ -137,36 +134,33 @@ class GeometryProblem:
 
     def _image_losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator):
         """Photometric and mask loss on the rays of one window."""
-        window = self.windows[step % len(self.windows)]
-        shift = tuple(int(s) for s in rng.integers(window.stride, size=2))
-        camera = window_camera(self.portrait.camera, window, shift)
-        x, y = principal_point_offset(camera)
-        self.parameters["sensor.principal_point_offset_x"] = x
-        self.parameters["sensor.principal_point_offset_y"] = y
-        self.parameters["sensor.x_fov"] = float(np.degrees(2 * np.arctan(camera.width / (2 * camera.K[0, 0]))))
         for name, value in tensors.items():
             self.parameters[_PARAMETERS[name]] = value
         self.parameters.update()
 
-        columns, rows = window_pixels(window, shift)
+        window = self.windows[step % len(self.windows)]
+        shift = tuple(int(s) for s in rng.integers(window.stride, size=2))
+        columns, rows = (index.ravel() for index in window_pixels(window, shift))
         height, width = self.valid.shape
         inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        columns, rows = np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1)
-        usable = (inside & self.valid[rows, columns]).astype(np.float32)
-        target = self.target[rows, columns]
+        columns, rows = columns[inside], rows[inside]
+        usable = self.valid[rows, columns]
+        columns, rows = columns[usable], rows[usable]
+        target = self.target[rows, columns].T
 
-        image = mi.render(self.scene, self.parameters, spp=1, seed=0)
-        hit = dr.detach(image[:, :, 3:4]).numpy()
-        covered = usable[..., None] * hit * (target[..., 3:4] > 0.5)
-        difference = dr.abs(losses.display(image[:, :, 0:3]) - losses.display(mi.TensorXf(target[..., :3])))
-        color = dr.sum(difference * mi.TensorXf(covered), axis=None) / (3 * max(covered.sum(), 1.0))
+        origin, direction = pixel_rays(self.portrait.camera, columns, rows)
+        ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(direction.T))
+        radiance, hit, (_, closest) = self.scene.integrator().sample(self.scene, None, ray)
+        covered = hit.numpy() & (target[3] > 0.5)
+        difference = losses.display(to_columns(radiance)) - losses.display(mi.TensorXf(target[:3]))
+        weight = mi.TensorXf(np.broadcast_to(covered / (3 * max(covered.sum(), 1)), (3, len(rows))).astype(np.float32))
+        color = dr.sum(dr.abs(difference) * weight, axis=None)
 
         # IDR's mask loss, BCE(σ(−α min f)) / α, from the logit −α min f.
         alpha = stage.mask_sharpness
-        logit = -alpha * image[:, :, 5:6]
-        entropy = dr.maximum(logit, 0.0) + dr.log(1 + dr.exp(-dr.abs(logit))) - logit * mi.TensorXf(target[..., 3:4])
-        open_rays = usable[..., None] * (1 - covered)
-        return color, dr.sum(entropy * mi.TensorXf(open_rays), axis=None) / (alpha * max(usable.sum(), 1.0))
+        logit = -alpha * closest
+        entropy = dr.maximum(logit, 0.0) + dr.log(1 + dr.exp(-dr.abs(logit))) - logit * mi.Float(target[3])
+        return color, dr.sum(entropy * mi.Float(~covered)) / (alpha * max(len(rows), 1))
 
     def _eikonal_points(self, rng: np.random.Generator):
         """Half uniform in the domain, half near the mesh; [3, points]."""

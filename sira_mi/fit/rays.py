@@ -1,6 +1,4 @@
-"""Which pixels a geometry step looks at: evenly spaced grids over a window of the photo, shifted at random.
-
-The grid is a small film of its own behind a shifted camera, so that a step is one ordinary `mi.render`."""
+"""Which pixels a geometry step looks at: evenly spaced grids over a window of the photo, shifted at random."""
 
 from dataclasses import dataclass
 
@@ -12,7 +10,7 @@ from sira_mi.portrait.camera import Camera
 
 @dataclass(frozen=True)
 class Window:
-    """A square of `size` × `size` film pixels, `stride` photo pixels apart, from (left, top) in the photo."""
+    """A square of `size` × `size` pixels, `stride` photo pixels apart, from (left, top) in the photo."""
 
     left: int
     top: int
@@ -27,17 +25,9 @@ def window_around(x0: float, y0: float, x1: float, y1: float, size: int) -> Wind
     return Window(round((x0 + x1 - side) / 2), round((y0 + y1 - side) / 2), stride, size)
 
 
-def window_camera(camera: Camera, window: Window, shift: tuple[int, int]) -> Camera:
-    """The camera of the window's film: its pixel centres are photo pixel centres, `shift` pixels into each stride."""
-    k = camera.K.copy()
-    k[:2] /= window.stride
-    for axis, start in enumerate((window.left + shift[0], window.top + shift[1])):
-        k[axis, 2] = (camera.K[axis, 2] - start - 0.5) / window.stride + 0.5
-    return Camera(k, camera.world_to_camera, window.size, window.size)
-
-
 def window_pixels(window: Window, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Photo columns and rows [size, size] of the film's pixels; they may lie outside the photo."""
+    """Photo columns and rows [size, size] of the window's pixels, `shift` pixels into each stride; they may lie outside
+    the photo."""
     steps = np.arange(window.size) * window.stride
     columns, rows = np.meshgrid(window.left + shift[0] + steps, window.top + shift[1] + steps)
     return columns, rows
