@@ -6,7 +6,7 @@ from sira_mi.errors import InputError
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.sdf import evaluate_in_chunks, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
-from sira_mi.models.af_sm import physical_radiance
+from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
@@ -36,6 +36,13 @@ class SiraSG(mi.SamplingIntegrator):
      * - visibility_directions
        - |int|
        - Directions of that share, 16 to 4096. (Default: 64)
+     * - aovs
+       - |bool|
+       - Give the extra channels. (Default: true)
+     * - shaded_lobes
+       - |tensor|
+       - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. Where something is
+         differentiated, all are summed up. (Default: all)
 
     Eq. 8 in closed form: the radiance that a `neural_sdf` with a `sira_bsdf` reflects under an `sg_envmap`, without
     sampling and without noise. Shadows come from rays against the scene's meshes in a fixed set of directions, half of
@@ -43,6 +50,8 @@ class SiraSG(mi.SamplingIntegrator):
     point and to have its albedo. `path` renders the same scene with both in full.
     Albedos that are `neural_albedo` textures are evaluated as networks in tensor mode; any other texture is asked at
     the hit. Other shapes only occlude.
+
+    Where k_s is 0 and not differentiated, the specular part is not computed.
 
     Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s), `diffuse_albedo.RGB`, `specular_albedo`,
     `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene
@@ -69,6 +78,8 @@ class SiraSG(mi.SamplingIntegrator):
         self.directions = int(props.get("visibility_directions", 64))
         if not 16 <= self.directions <= 4096:
             raise InputError(f"sira_sg: visibility_directions is {self.directions}; it must be 16 to 4096")
+        self.aovs = bool(props.get("aovs", True))
+        self.shaded_lobes = np.array(props["shaded_lobes"]).astype(int) if "shaded_lobes" in props else None
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         head = find_head(scene, "sira_sg")
@@ -87,16 +98,19 @@ class SiraSG(mi.SamplingIntegrator):
             si.wi = -ray.d
             background = light.eval(si, active & ~hit)
         index = dr.compress(hit)
-        parts = {name: dr.zeros(mi.Color3f, width) for name in ("diffuse", "specular", "diffuse_albedo", "normal")}
-        parts["specular_albedo"] = dr.zeros(mi.Float, width)
+        rows_of = _ROWS if self.aovs else {name: _ROWS[name] for name in ("diffuse", "specular")}
+        kinds = {name: mi.Color3f if rows == 3 else mi.Float for name, rows in rows_of.items()}
+        parts = {name: dr.zeros(kind, width) for name, kind in kinds.items()}
         if dr.width(index) > 0:
             columns = self._shade(scene, head, bsdf, light, ray, t, index)
             row = 0
-            for name, rows in _ROWS.items():
-                kind = mi.Color3f if rows == 3 else mi.Float
-                parts[name] = scatter_columns(columns[row : row + rows, :], index, width, kind)
+            for name, rows in rows_of.items():
+                parts[name] = scatter_columns(columns[row : row + rows, :], index, width, kinds[name])
                 row += rows
         color = dr.select(hit, parts["diffuse"] + parts["specular"], background)
+        valid = active & (hit | (not self.hide_environment))
+        if not self.aovs:
+            return color, valid, []
         depth = dr.select(hit, t, 0.0)
         aovs = [
             *parts["diffuse"],
@@ -107,13 +121,19 @@ class SiraSG(mi.SamplingIntegrator):
             depth,
             dr.select(hit, mi.Float(1.0), 0.0),
         ]
-        return color, active & (hit | (not self.hide_environment)), aovs
+        return color, valid, aovs
 
     def _shade(self, scene, head, bsdf, light, ray, t, index):
-        """All of `_ROWS` at the hits `index`, as one tensor [13, n]; in chunks when nothing is differentiated."""
+        """All of `_ROWS` at the hits `index`, as one tensor [13, n], or the radiances [6, n] without extra channels; in
+        chunks when nothing is differentiated."""
         field = head.field()
         local = head.to_local @ ray
-        lobes = local_lobes(light, head)
+        origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
+        attached = dr.grad_enabled(*differentiable_arrays(head, bsdf, light), origin, direction)
+        lobes = all_lobes = local_lobes(light, head)
+        if not attached:
+            lobes = self._shaded(lobes)
+        speculars = attached or bsdf.k_s.numpy().item() != 0
         k_s = mi.TensorXf(bsdf.k_s, (1, 1))
         rotation = mi.TensorXf(rotation_of(head.to_world))
 
@@ -126,28 +146,47 @@ class SiraSG(mi.SamplingIntegrator):
             return to_columns(value + dr.zeros(mi.Float, x.shape[1]))
 
         if self.visibility:
-            directions = visibility.light_directions(dr.detach(lobes).numpy(), self.directions)
+            directions = visibility.light_directions(dr.detach(all_lobes).numpy(), self.directions)
+
+        def radiances(x, normal, view, diffuse, specular):
+            is_open = open_directions(scene, head, x, normal, directions) if self.visibility else None
+            arrival = None
+            if not speculars:
+                if self.visibility:
+                    arrival = visibility.diffuse_arrival(normal, all_lobes, directions, is_open)
+                lit = diffuse_radiance(diffuse, normal, lobes, arrival)
+                return lit, dr.zeros(mi.TensorXf, lit.shape)
+            if self.visibility:
+                arrival = visibility.arrival(normal, -view, specular, bsdf.roughness, all_lobes, directions, is_open)
+            return physical_radiance(diffuse, specular, normal, view, bsdf.roughness, k_s, lobes, arrival)
 
         def columns(x, direction):
             _, gradient, x_ref, gamma = surface(field, x)
             normal = normalised(gradient)
             diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
-            specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1)
-            view, arrival = normalised(direction), None
-            if self.visibility:
-                is_open = open_directions(scene, head, x, normal, directions)
-                arrival = visibility.arrival(normal, -view, specular, bsdf.roughness, lobes, directions, is_open)
-            radiance = physical_radiance(diffuse, specular, normal, view, bsdf.roughness, k_s, lobes, arrival)
-            return dr.concat([*radiance, diffuse, specular, rotation @ normal], axis=0)
+            specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1) if speculars or self.aovs else None
+            radiance = radiances(x, normal, normalised(direction), diffuse, specular)
+            extra = (diffuse, specular, rotation @ normal) if self.aovs else ()
+            return dr.concat([*radiance, *extra], axis=0)
 
-        origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
-        if not dr.grad_enabled(*differentiable_arrays(head, bsdf, light), origin, direction):
+        if not attached:
             x = on_ray(origin, direction, parameter)
             return mi.TensorXf(evaluate_in_chunks(columns, x.numpy(), direction.numpy())[0])
         parameter = dr.detach(parameter)
         return columns(differentiable_hit(field, origin, direction, parameter), direction)
 
+    def _shaded(self, lobes):
+        """Those of `lobes` [N_l, 7] that the closed form sums up."""
+        if self.shaded_lobes is None:
+            return lobes
+        count = lobes.shape[0]
+        if not (len(self.shaded_lobes) and ((self.shaded_lobes >= 0) & (self.shaded_lobes < count)).all()):
+            raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
+        return mi.TensorXf(np.ascontiguousarray(lobes.numpy()[self.shaded_lobes]))
+
     def aov_names(self):
+        if not self.aovs:
+            return []
         names = []
         for name, channels in (("diffuse", "RGB"), ("specular", "RGB"), ("diffuse_albedo", "RGB")):
             names += [f"{name}.{c}" for c in channels]

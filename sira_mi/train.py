@@ -4,16 +4,20 @@
 `prior.safetensors`, which a fit takes with `--prior`. Both write a log and pictures, and resume from their checkpoints.
 """
 
+from __future__ import annotations
+
 import argparse
 import dataclasses
 import json
 from pathlib import Path
-
-import mitsuba as mi
-import numpy as np
+from typing import TYPE_CHECKING
 
 from sira_mi.errors import InputError, run_command
-from sira_mi.models.avatar import AvatarArchitecture
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from sira_mi.models.avatar import AvatarArchitecture
 
 # The loss terms of each model whose weight λ is a setting of that name.
 SHAPE_TERMS = (
@@ -50,6 +54,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if (arguments.steps is not None and arguments.steps < 1) or arguments.picture_steps < 1:
         raise InputError("--steps and --picture-steps are at least 1")
+
+    import mitsuba as mi
+
     mi.set_variant(arguments.variant)
     train = train_shape if arguments.model == "shape" else train_appearance
     train(
@@ -65,6 +72,8 @@ def main() -> None:
 
 def parse_sizes(items: list[str]) -> dict[str, int]:
     """`["sdf_width=64", ...]` as sizes of an AvatarArchitecture. Raises InputError for anything else."""
+    from sira_mi.models.avatar import AvatarArchitecture
+
     names, sizes = [field.name for field in dataclasses.fields(AvatarArchitecture)], {}
     for item in items:
         name, _, value = item.partition("=")
@@ -100,6 +109,8 @@ def without_term(settings, terms: tuple[str, ...], without: str | None):
 
 def read_architecture(metadata: dict[str, str], checkpoint: Path) -> AvatarArchitecture:
     """The architecture that a training's checkpoint holds. Raises InputError when there is none."""
+    from sira_mi.models.avatar import AvatarArchitecture
+
     try:
         return AvatarArchitecture(**json.loads(metadata["architecture"]))
     except (KeyError, TypeError, ValueError) as error:
@@ -131,9 +142,11 @@ def train_shape(
 
     A field without deformation has no reference space for albedos: `out/prior.safetensors` is written at once then,
     with untrained appearance."""
+    import numpy as np
+
     from sira_mi.models import sa_sm
     from sira_mi.models.af_sm import initial_appearance_model
-    from sira_mi.models.avatar import save_avatar
+    from sira_mi.models.avatar import AvatarArchitecture, save_avatar
     from sira_mi.models.optimisation import adam
     from sira_mi.models.pictures import shape_picture
     from sira_mi.models.prior import assemble_prior
@@ -190,6 +203,8 @@ def train_appearance(
     """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`, whose architecture it takes over; writes
     `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only; `scenes` are the
     collection's if they are loaded already."""
+    import numpy as np
+
     from sira_mi.models import af_sm
     from sira_mi.models.avatar import save_avatar
     from sira_mi.models.optimisation import adam

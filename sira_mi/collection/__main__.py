@@ -3,16 +3,6 @@
 import argparse
 from pathlib import Path
 
-import mitsuba as mi
-
-from sira_mi.collection.annotation import check_landmarks
-from sira_mi.collection.build import VARIANT, BuildSettings, build
-from sira_mi.collection.hair import list_hair
-from sira_mi.collection.sheet import write_sheet
-from sira_mi.collection.sources.ict import IctSource
-from sira_mi.collection.sources.makehuman import MakeHumanSource
-from sira_mi.collection.sources.meshes import MeshSource
-from sira_mi.collection.sources.valid import ValidSource
 from sira_mi.errors import InputError, run_command
 
 # Seed of the first head of the landmark check; no collection's heads have it.
@@ -44,6 +34,10 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.command == "landmarks":
         return print_landmark_errors(arguments.heads, arguments.hair)
+
+    from sira_mi.collection.build import BuildSettings, build
+    from sira_mi.collection.sheet import write_sheet
+
     if arguments.command == "sheet":
         write_sheet(arguments.folder, arguments.out, count=arguments.count, views=tuple(arguments.views))
         return 0
@@ -63,6 +57,12 @@ def print_landmark_errors(heads: int, hair: Path | None) -> int:
     """Prints how far automatic landmarks are from the known ones of MakeHuman heads."""
     if heads < 1:
         raise InputError("--heads must be at least 1")
+
+    import mitsuba as mi
+
+    from sira_mi.collection.annotation import check_landmarks
+    from sira_mi.collection.build import VARIANT
+
     mi.set_variant(VARIANT)
     errors = check_landmarks([FIRST_CHECKED + k for k in range(heads)], hair)
     print(
@@ -75,6 +75,12 @@ def print_landmark_errors(heads: int, hair: Path | None) -> int:
 
 def sources_of(arguments: argparse.Namespace) -> tuple:
     """The sources that the command line names."""
+    from sira_mi.collection.hair import list_hair
+    from sira_mi.collection.sources.ict import IctSource
+    from sira_mi.collection.sources.makehuman import MakeHumanSource
+    from sira_mi.collection.sources.meshes import MeshSource
+    from sira_mi.collection.sources.valid import ValidSource
+
     if arguments.hair is not None:
         list_hair(arguments.hair)
     sources = [MakeHumanSource(arguments.count, arguments.hair)]

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 
@@ -106,6 +105,8 @@ def _mesh(values: np.ndarray, spacing: float) -> ExtractedSurface:
     padded = np.pad(values, 1, constant_values=np.float32(1e-3 * spacing))
     if not (padded.min() < 0 < padded.max()):
         raise EmptySurfaceError("the field has no surface inside the domain")
+    from skimage.measure import marching_cubes
+
     vertices, faces, _, _ = marching_cubes(padded, 0.0, allow_degenerate=False)
     lower = np.array(DOMAIN_LOWER, np.float32)
     upper = lower + np.float32(spacing) * (np.array(values.shape, np.float32) - 1)

@@ -5,12 +5,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.appearance import albedo_refinement, refined_albedo
-from sira_mi.fields.sdf import in_three
+from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, refined_albedo
+from sira_mi.fields.sdf import evaluate_in_chunks, in_three
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import base_albedo, decoder, photo_points, shade_points, skin_patches
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar
+from sira_mi.plan.decisions import Plan
+from sira_mi.plan.fit import BASE_ALBEDO, SPECULARS, plan_fit
 from sira_mi.portrait.portrait import Portrait
 
 # ε of the smoothness of the refinement, scene units.
@@ -18,10 +20,15 @@ _JITTER = 0.01
 
 
 class AppearanceProblem:
-    """The losses of the appearance stages for one portrait on the fitted geometry of the avatar at `avatar_path`."""
+    """The losses of the appearance stages for one portrait on the fitted geometry of the avatar at `avatar_path`.
+    `plan` says what each stage leaves out (default: all that `plan_fit` finds)."""
 
-    def __init__(self, portrait: Portrait, avatar: Avatar, avatar_path: str, settings: FitSettings):
+    def __init__(
+        self, portrait: Portrait, avatar: Avatar, avatar_path: str, settings: FitSettings, plan: Plan | None = None
+    ):
         self.avatar, self.settings = avatar, settings
+        self.plan = plan_fit(settings) if plan is None else plan
+        self._base_at, self._base = None, None
         head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": settings.voxel})
         self.points = photo_points(portrait, head)
         self.skin = skin_patches(portrait, self.points)
@@ -46,6 +53,26 @@ class AppearanceProblem:
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Makes arrays of all tensors, those that the stage holds fixed included."""
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
+        decoder_of_base = tensors["diffuse_albedo"], tensors["z_a"]
+        if self._base_at is None or not all(map(np.array_equal, self._base_at, decoder_of_base)):
+            self._base_at, self._base = decoder_of_base, None
+
+    def _base_and_skin(self, current: dict, stage: Stage, index: np.ndarray) -> tuple:
+        """Base albedo [3, n] at the points `index` and the loss of the skin's tone (None without skin); of a stage that
+        holds both fixed, both are evaluated once."""
+        if not self.plan.leaves_out(BASE_ALBEDO, stage.name):
+            skin = None if self.skin is None else self.skin.loss(self.avatar, current)
+            return base_albedo(self.avatar, current, self.points[index]), skin
+        if self._base is None:
+            a, points = self.avatar.architecture, self.points
+            network = decoder(self.avatar, "diffuse_albedo", self._fixed, "z_a")
+            (base,) = evaluate_in_chunks(
+                lambda x_ref, gamma: diffuse_albedo(network, a.albedo_octaves, x_ref, gamma), points.x_ref, points.gamma
+            )
+            skin = None if self.skin is None else self.skin.loss(self.avatar, self._fixed)
+            self._base = base, skin
+        base, skin = self._base
+        return mi.TensorXf(np.ascontiguousarray(base[:, index])), skin
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights, a = self.settings.appearance, self.avatar.architecture
@@ -55,7 +82,10 @@ class AppearanceProblem:
 
         share = step / max(stage.steps - 1, 1)
         k_s = stage.k_s[0] + (stage.k_s[1] - stage.k_s[0]) * min(1.0, 2 * share)
-        base = albedo = base_albedo(self.avatar, current, points)
+        if self.plan.leaves_out(SPECULARS, stage.name):
+            k_s = None
+        base, skin_tone = self._base_and_skin(current, stage, index)
+        albedo = base
         if stage.k_r > 0:
             network = decoder(self.avatar, "albedo_refinement", current)
             x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
@@ -69,8 +99,8 @@ class AppearanceProblem:
             * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"])),
             "white_light": weights.white_light * _chroma(shading.lobes),
         }
-        if self.skin is not None:
-            terms["skin_tone"] = weights.skin_tone * self.skin.loss(self.avatar, current)
+        if skin_tone is not None:
+            terms["skin_tone"] = weights.skin_tone * skin_tone
         if stage.k_r > 0:
             moved = x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(index)))).astype(np.float32))
             rough = fine - albedo_refinement(network, a.refinement_octaves, moved, gamma)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-import trimesh
 from PIL import Image
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
@@ -57,13 +56,20 @@ def render_layers(scene: mi.Scene) -> dict[str, np.ndarray]:
     }
 
 
-def avatar_scene(avatar_path: str, camera: Camera, lobes: np.ndarray, voxel: float) -> mi.Scene:
+def render_radiance(scene: mi.Scene) -> np.ndarray:
+    """The radiance [H, W, 3] of an `avatar_scene`, with or without its extra channels."""
+    return mi.render(scene, spp=_SAMPLES, seed=0).numpy()[..., :3]
+
+
+def avatar_scene(
+    avatar_path: str, camera: Camera, lobes: np.ndarray, voxel: float, extra_channels: bool = True
+) -> mi.Scene:
     """The head of an avatar file before a black background, closed-form shading, `lobes` [N_l, 7] as its light; evenly
-    spread samples in each pixel, against jagged outlines."""
+    spread samples in each pixel, against jagged outlines. `extra_channels` are those of `LAYERS` but the radiance."""
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "sira_sg", "hide_emitters": True},
+            "integrator": {"type": "sira_sg", "hide_emitters": True, "aovs": extra_channels},
             "sensor": sensor(camera, {"type": "stratified", "sample_count": _SAMPLES}),
             "head": head(avatar_path, voxel),
             "light": {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)},
@@ -100,6 +106,8 @@ def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
 def write_mesh(path: Path, shape) -> None:
     """A PLY of a `neural_sdf` in metres (+y up, facing +z), with the field's normals and, as vertex colours, the sRGB
     diffuse albedo."""
+    import trimesh
+
     vertices = shape.vertices()
     field, texture = shape.field(), shape.bsdf().diffuse_albedo
 

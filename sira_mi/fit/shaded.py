@@ -13,14 +13,14 @@ from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
-from sira_mi.models.af_sm import AppearanceTraining, physical_radiance
+from sira_mi.models.af_sm import AppearanceTraining, diffuse_radiance, physical_radiance
 from sira_mi.models.avatar import Avatar
 from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.scene import sensor
-from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, even_directions, trace_open
+from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, diffuse_arrival, even_directions, trace_open
 
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
@@ -134,17 +134,21 @@ class Shading:
     specular: mi.TensorXf  # [3, N] radiance, times k_s
 
 
-def shade_points(avatar: Avatar, tensors: dict, k_s: float, points: PhotoPoints, albedo, normal=None) -> Shading:
+def shade_points(avatar: Avatar, tensors: dict, k_s: float | None, points: PhotoPoints, albedo, normal=None) -> Shading:
     """Light and radiance at `points` of diffuse `albedo` [3, N] by the decoders at `tensors` (Floats); `normal` [3, N],
-    a tensor, may stand in for the points' own. Light counts where it arrives, as in the `sira_sg` integrator."""
+    a tensor, may stand in for the points' own. Light counts where it arrives, as in the `sira_sg` integrator. With
+    `k_s` None the specular part is left out, which is 0 then."""
     octaves = avatar.architecture.specular_octaves
     view = mi.TensorXf(points.view)
     normal = mi.TensorXf(points.normal) if normal is None else normal
-    network = decoder(avatar, "specular_albedo", tensors, "z_s")
-    specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
     lobes = decode_lobes(avatar, tensors)
     is_open = mi.TensorXf(points.is_open.astype(np.float32))
     directions = even_directions(DIRECTIONS)
+    if k_s is None:
+        diffuse = diffuse_radiance(albedo, normal, lobes, diffuse_arrival(normal, lobes, directions, is_open))
+        return Shading(lobes, diffuse, dr.zeros(mi.TensorXf, diffuse.shape))
+    network = decoder(avatar, "specular_albedo", tensors, "z_s")
+    specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
     arrives = arrival(normal, -view, specular, mi.Float(avatar.roughness), lobes, directions, is_open)
     radiance = physical_radiance(albedo, specular, normal, view, avatar.roughness, k_s, lobes, arrives)
     return Shading(lobes, *radiance)

@@ -3,7 +3,6 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.sdf import in_three
@@ -28,6 +27,8 @@ _SKIN_OUTLIER = 2.0
 
 def skin_radiance(scene: TrainingScene, landmarks: np.ndarray) -> float:
     """Geometric mean of the luminance of the observations near `landmarks` [L, 3]; NaN when there are none."""
+    from scipy.spatial import cKDTree
+
     if not len(landmarks):
         return float("nan")
     near = cKDTree(landmarks).query(scene.points, distance_upper_bound=_SKIN_RADIUS)[0] < _SKIN_RADIUS

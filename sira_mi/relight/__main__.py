@@ -3,10 +3,8 @@
 import argparse
 import math
 import tempfile
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-from tqdm import tqdm
 
 from sira_mi.errors import InputError, run_command
 
@@ -65,6 +63,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--compare", action="store_true", help="render with both integrators under the same lobes; print the difference"
     )
+    parser.add_argument(
+        "--explain", action="store_true", help="say what is left out, and measure each on a small picture"
+    )
+    parser.add_argument("--keep-all", action="store_true", help="leave nothing out; with path that is --exact, too")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
     return parser
 
@@ -84,6 +86,8 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--yaw is {options.yaw}; it must be a number of degrees")
     if options.compare and options.turntable:
         raise InputError("--compare and --turntable do not go together; give one of them")
+    if options.compare and (options.explain or options.keep_all):
+        raise InputError("--compare leaves nothing out; --explain and --keep-all do not go with it")
     if options.exact and options.integrator == "sg" and not options.compare:
         raise InputError("--exact belongs to --integrator path; closed-form shading is always exact")
 
@@ -104,13 +108,24 @@ def output_stem(out: Path) -> Path:
     return stem
 
 
-def write_image(stem: Path, radiance: np.ndarray, exposure: float = 0.0) -> None:
-    """`stem`.exr with linear radiance [H, W, 3], and `stem`.png in sRGB, 2**exposure times as bright."""
-    from sira_mi.files import write_exr, write_png
-    from sira_mi.portrait.load import linear_to_srgb
+def _planned(subject, light, settings, yaws: list[float], options: argparse.Namespace) -> tuple:
+    """The settings of the pictures at `yaws`, and the head for them, as `--keep-all` and the plan say; `--explain`
+    prints the plan."""
+    from sira_mi.plan.decisions import explain
+    from sira_mi.plan.measure import measured
+    from sira_mi.plan.relight import plan_relight
+    from sira_mi.relight.render import load_head
 
-    write_exr(stem.with_name(stem.name + ".exr"), radiance)
-    write_png(stem.with_name(stem.name + ".png"), linear_to_srgb(np.clip(radiance * 2.0**exposure, 0, 1)))
+    everything = replace(settings, exact=settings.integrator == "path")
+    if options.keep_all and not options.explain:
+        return everything, load_head(subject, everything)
+    shape = load_head(subject, settings)
+    plan = plan_relight(subject, light, shape, everything, yaws, exact=settings.exact)
+    if options.explain:
+        print(explain(measured(plan, subject, light, everything, yaws[0])), flush=True)
+    chosen = (plan.keeping() if options.keep_all else plan).apply(everything)
+    reloaded = (chosen.exact, chosen.speculars) != (settings.exact, settings.speculars)
+    return chosen, load_head(subject, chosen) if reloaded else shape
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -119,9 +134,11 @@ def main(arguments: list[str] | None = None) -> int:
     _check(options)
     stem = output_stem(options.out)
 
+    from tqdm import tqdm
+
     from sira_mi.fit.fit import set_variant
     from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare
-    from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
+    from sira_mi.relight.render import RelightSettings, render_passes, turned_scene, write_image
     from sira_mi.relight.subject import read_light, read_subject
 
     set_variant(options.variant)
@@ -150,10 +167,11 @@ def main(arguments: list[str] | None = None) -> int:
 
     frames = options.turntable or 1
     digits = max(3, len(str(frames - 1)))
-    shape = load_head(subject, settings)
+    yaws = [options.yaw + 360 * frame / frames for frame in range(frames)]
+    settings, shape = _planned(subject, light, settings, yaws, options)
     with tqdm(total=frames * settings.samples, unit="spp", disable=None) as bar:
-        for frame in range(frames):
-            scene = turned_scene(shape, subject.camera, light, options.yaw + 360 * frame / frames, settings)
+        for frame, yaw in enumerate(yaws):
+            scene = turned_scene(shape, subject.camera, light, yaw, settings)
             radiance = render_passes(scene, settings, bar.update)[..., :3]
             name = f"{stem.name}_{frame:0{digits}d}" if options.turntable else stem.name
             write_image(stem.with_name(name), radiance, options.exposure)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
+from sira_mi.files import write_exr, write_png
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.subject import Light, Subject
 from sira_mi.scene import head, orbited, sensor
 
@@ -30,6 +33,12 @@ class RelightSettings:
     exact: bool = False  # path tracing evaluates the albedo networks at every hit instead of once a vertex
     background: bool = False  # show the environment behind the head
     voxel: float = 0.03  # of the mesh that is traced, scene units
+    speculars: bool = True  # k_s r^s
+    max_depth: int = -1  # path: edges from the camera to the light; -1 for any number
+    visibility: bool = True  # sg: shadows and one bounce
+    extra_channels: bool = True  # sg: those that `sira_sg` gives beside the radiance
+    kept_lobes: tuple[int, ...] | None = None  # numbers of the lobes that light the head; None for all
+    crop: bool = False  # trace only the rectangle of the film that the head is in
 
     def pass_samples(self, width: int, height: int) -> list[int]:
         """Samples a pixel of every pass over a picture of that size."""
@@ -44,10 +53,12 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
     description = head(subject.path.absolute(), settings.voxel)
     bsdf = description["bsdf"]
     bsdf["roughness"] = subject.avatar.roughness
-    bsdf["k_s"] = subject.avatar.k_s
+    bsdf["k_s"] = subject.avatar.k_s if settings.speculars else 0.0
     if settings.integrator == "path" and not settings.exact:
         for texture in ("diffuse_albedo", "specular_albedo"):
             bsdf[texture]["baked"] = True
+    if settings.integrator == "path" and not settings.speculars:
+        description["bsdf"] = {"type": "diffuse", "reflectance": bsdf["diffuse_albedo"]}
     try:
         return mi.load_dict(description)
     except RuntimeError as error:  # Mitsuba's, with the plugin's own as its text
@@ -63,27 +74,59 @@ def turned_scene(
     light. Camera and light are moved about the head instead, which gives the same picture of the same mesh."""
     angle = np.radians(-yaw_degrees)
     back = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    integrator = {"type": INTEGRATORS[settings.integrator], "hide_emitters": not settings.background}
+    if settings.integrator == "path":
+        integrator["max_depth"] = settings.max_depth
+        light = light.only(settings.kept_lobes)
+    else:
+        integrator |= {"visibility": settings.visibility, "aovs": settings.extra_channels}
+        if settings.kept_lobes is not None:
+            integrator["shaded_lobes"] = mi.TensorXf(np.array(settings.kept_lobes, np.float32))
+    view = orbited(camera, yaw_degrees)
+    eye = sensor(view)
+    if settings.crop:
+        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        eye["film"] |= dict(zip(names, head_window(shape, view), strict=True))
     return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": INTEGRATORS[settings.integrator], "hide_emitters": not settings.background},
-            "sensor": sensor(orbited(camera, yaw_degrees)),
-            "head": shape,
-            "light": light.turned(back),
-        }
+        {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": light.turned(back)}
     )
+
+
+def head_window(shape: mi.Shape, camera: Camera) -> tuple[int, int, int, int]:
+    """The rectangle (x, y, width, height) of the film, in pixels, outside of which no ray meets the mesh of a
+    `neural_sdf`: all of it where a vertex lies beside or behind the camera."""
+    vertices = shape.vertices()
+    place = camera.K @ (camera.world_to_camera[:3, :3] @ vertices + camera.world_to_camera[:3, 3:])
+    if place[2].min() <= 1e-3:
+        return 0, 0, camera.width, camera.height
+    pixels = place[:2] / place[2]
+    size = np.array([camera.width, camera.height])
+    low = np.clip(np.floor(pixels.min(axis=1)) - 1, 0, size - 1).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=1)) + 1, low + 1, size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
 def render_passes(
     scene: mi.Scene, settings: RelightSettings, done: Callable[[int], object] | None = None
 ) -> np.ndarray:
-    """The film's channels [H, W, channels] (float32), averaged over passes that bound the memory. After each pass
-    `done` is called with its samples a pixel. The same seed gives the same picture."""
-    width, height = scene.sensors()[0].film().size()
+    """The film's channels [H, W, channels] (float32), averaged over passes that bound the memory; 0 outside the part
+    of the film that is traced. After each pass `done` is called with its samples a pixel. The same seed gives the same
+    picture."""
+    film = scene.sensors()[0].film()
+    (width, height), (x, y) = film.crop_size(), film.crop_offset()
     total = 0.0
     for k, samples in enumerate(settings.pass_samples(int(width), int(height))):
         seed = int(np.random.SeedSequence([settings.seed, k]).generate_state(1)[0])
         total = total + samples * mi.render(scene, spp=samples, seed=seed).numpy().astype(np.float64)
         if done is not None:
             done(samples)
-    return (total / settings.samples).astype(np.float32)
+    columns, rows = film.size()
+    picture = np.zeros((int(rows), int(columns), total.shape[2]), np.float32)
+    picture[int(y) : int(y + height), int(x) : int(x + width)] = total / settings.samples
+    return picture
+
+
+def write_image(stem: Path, radiance: np.ndarray, exposure: float = 0.0) -> None:
+    """`stem`.exr with linear radiance [H, W, 3], and `stem`.png in sRGB, 2**exposure times as bright."""
+    write_exr(stem.with_name(stem.name + ".exr"), radiance)
+    write_png(stem.with_name(stem.name + ".png"), linear_to_srgb(np.clip(radiance * 2.0**exposure, 0, 1)))

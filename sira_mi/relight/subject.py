@@ -1,7 +1,9 @@
 """What is relit: an avatar, the camera that it was photographed by, and a light from a file."""
 
+from __future__ import annotations
+
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -31,6 +33,15 @@ class Subject:
     avatar: Avatar
     camera: Camera
 
+    def scaled(self, size: int) -> Subject:
+        """The same in a picture whose longer side has `size` pixels."""
+        longer = max(self.camera.width, self.camera.height)
+        width, height = (max(1, round(side * size / longer)) for side in (self.camera.width, self.camera.height))
+        return replace(
+            self,
+            camera=self.camera.scaled(width / self.camera.width, height / self.camera.height, width, height),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Light:
@@ -39,6 +50,10 @@ class Light:
 
     lobes: np.ndarray | None
     image: np.ndarray | None = None
+
+    def only(self, numbers: tuple[int, ...] | None) -> Light:
+        """The light of some of the lobes; None for all."""
+        return self if numbers is None else Light(self.lobes[list(numbers)], self.image)
 
     def turned(self, rotation: np.ndarray) -> dict:
         """The emitter for `mi.load_dict`, turned by `rotation` [3, 3]: `envmap` of the image if there is one, else
@@ -63,12 +78,8 @@ def read_subject(path: Path, size: int | None = None) -> Subject:
         raise InputError(f"{what}; give the output folder of a fit, or an avatar.safetensors")
     avatar = load_avatar(file)
     report = file.with_name("avatar.json")
-    camera = _read_camera(report) if report.is_file() else PORTRAIT_CAMERA
-    if size is not None:
-        longer = max(camera.width, camera.height)
-        width, height = (max(1, round(side * size / longer)) for side in (camera.width, camera.height))
-        camera = camera.scaled(width / camera.width, height / camera.height, width, height)
-    return Subject(file, avatar, camera)
+    subject = Subject(file, avatar, _read_camera(report) if report.is_file() else PORTRAIT_CAMERA)
+    return subject if size is None else subject.scaled(size)
 
 
 def _read_camera(report: Path) -> Camera:

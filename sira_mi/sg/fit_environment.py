@@ -11,7 +11,6 @@ to its flux.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions
@@ -137,6 +136,8 @@ def _cluster(directions, weight, count):
 
 def _solve_amplitudes(axes, sharpness, directions, weight, radiance, flux):
     """Non-negative amplitudes `[N, 3]` of least weighted error whose light is nearly `flux` `[3]`."""
+    from scipy.optimize import nnls
+
     basis = np.exp(sharpness * (np.clip(directions @ axes.T, -1.0, 1.0) - 1.0))
     energy = sphere_integral(sharpness)
     root = np.sqrt(weight)[:, None]

@@ -6,6 +6,7 @@ and its closed form with one cosine integral instead of a two-term cosine: the b
 """
 
 import math
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -71,8 +72,21 @@ def specular_radiance_physg(
     return amplitude * dr.select(cosine > 0.0, 0.25 * lobe_amplitude * moment * integral, 0.0)
 
 
+class DiffusePoint(NamedTuple):
+    """What the irradiance alone needs of a shading point."""
+
+    normal: "mi.Vector3f"
+
+
+def _point(values):
+    """The shading point of the flat `values` of one."""
+    return DiffusePoint(*values) if len(values) == 1 else SpecularLobes(*values)
+
+
 def _integrate_lobe(point, axis, sharpness, amplitude):
-    """Irradiance, white and grazing specular radiance `[..., 3]` of one light lobe."""
+    """Irradiance of one light lobe and, but at a `DiffusePoint`, white and grazing specular radiance `[..., 3]`."""
+    if isinstance(point, DiffusePoint):
+        return (diffuse_irradiance(point.normal, axis, sharpness, amplitude),)
     white, grazing = specular_integrals(point, axis, sharpness)
     return diffuse_irradiance(point.normal, axis, sharpness, amplitude), amplitude * white, amplitude * grazing
 
@@ -83,19 +97,20 @@ def _weigh(parts, gradient):
 
 
 def _sum_over_lobes(point, packed, count):
-    """Irradiance, white and grazing specular radiance under all lobes, by a symbolic loop in each lane.
+    """What `_integrate_lobe` gives, of all lobes, by a symbolic loop in each lane.
 
     `max_iterations` lets Dr.Jit differentiate the loop in reverse mode."""
+    labels = ("irradiance",) if isinstance(point, DiffusePoint) else ("irradiance", "white", "grazing")
 
     def body(index, *sums):
         parts = _integrate_lobe(point, *unpack_lobe(packed, index))
         return index + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
     return dr.while_loop(
-        state=(mi.UInt32(0), mi.Color3f(0.0), mi.Color3f(0.0), mi.Color3f(0.0)),
+        state=(mi.UInt32(0), *(mi.Color3f(0.0) for _ in labels)),
         cond=lambda index, *_: index < count,
         body=body,
-        labels=("index", "irradiance", "white", "grazing"),
+        labels=("index", *labels),
         max_iterations=count,
     )[1:]
 
@@ -106,7 +121,7 @@ def _point_gradient(point, packed, count, gradient):
     def body(index, *sums):
         inputs = tuple(type(value)(value) for value in point)
         dr.enable_grad(inputs)
-        parts = _integrate_lobe(SpecularLobes(*inputs), *unpack_lobe(packed, index))
+        parts = _integrate_lobe(_point(inputs), *unpack_lobe(packed, index))
         dr.backward(_weigh(parts, gradient), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return index + 1, *(total + dr.grad(value) for total, value in zip(sums, inputs, strict=True))
 
@@ -134,7 +149,7 @@ def _lobe_gradient(point, packed, count, gradient):
     def body(step, *sums):
         index = chunk * _POINTS_PER_LANE + step
         active = index < points
-        here = SpecularLobes(*(dr.gather(type(value), value, index, active) for value in point))
+        here = _point([dr.gather(type(value), value, index, active) for value in point])
         weights = [dr.gather(mi.Color3f, value, index, active) for value in gradient]
         axis, sharpness, amplitude = inputs = unpack_raw(packed, lobe)
         dr.enable_grad(inputs)
@@ -157,10 +172,11 @@ def _lobe_gradient(point, packed, count, gradient):
 
 
 class _SumOverLobes(dr.CustomOp):
-    """`_sum_over_lobes` with adjoints whose sums have a fixed order."""
+    """`_sum_over_lobes` with adjoints whose sums have a fixed order; `attached` says whether that of the lobes and that
+    of the point are wanted."""
 
-    def eval(self, packed, count, *point):
-        self.inputs = SpecularLobes(*point), packed, count
+    def eval(self, packed, count, attached, *point):
+        self.inputs, self.attached = (_point(point), packed, count), attached
         return _sum_over_lobes(*self.inputs)
 
     def forward(self):
@@ -171,17 +187,35 @@ class _SumOverLobes(dr.CustomOp):
             dr.enable_grad(inputs)
             for value, tangent in zip(inputs, tangents, strict=True):
                 dr.set_grad(value, tangent)
-            result = _sum_over_lobes(SpecularLobes(*inputs[1:]), inputs[0], count)
+            result = _sum_over_lobes(_point(inputs[1:]), inputs[0], count)
             self.set_grad_out(dr.forward_to(result))
 
     def backward(self):
         gradient = self.grad_out()
         with dr.resume_grad():
-            self.set_grad_in("point", _point_gradient(*self.inputs, gradient))
-            self.set_grad_in("packed", _lobe_gradient(*self.inputs, gradient))
+            lobes, point = self.attached
+            if point:
+                self.set_grad_in("point", _point_gradient(*self.inputs, gradient))
+            if lobes:
+                self.set_grad_in("packed", _lobe_gradient(*self.inputs, gradient))
 
     def name(self):
         return "sum_over_lobes"
+
+
+def _sums(point, lobes):
+    """`_sum_over_lobes` of a shading point under `lobes` `[N_l, 7]`, differentiable; its adjoint repeats bit for bit
+    outside symbolic code."""
+    count = lobe_count(lobes)
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        return _sum_over_lobes(point, lobes.array, count)
+    attached = dr.grad_enabled(lobes.array), dr.grad_enabled(*point)
+    return dr.custom(_SumOverLobes, lobes.array, count, attached, *point)
+
+
+def irradiance(normal: "mi.Vector3f", lobes: "mi.TensorXf") -> "mi.Color3f":
+    """The irradiance of `shade` alone, for surfaces without a specular part."""
+    return _sums(DiffusePoint(normal), lobes)[0]
 
 
 def shade(
@@ -196,12 +230,8 @@ def shade(
     Unit vectors, `view` pointing away from the surface. Differentiable in every argument. Outside symbolic code the
     gradients have the same bits on every run; inside a symbolic loop or call they go through Dr.Jit's own
     differentiation of the loop over lobes, whose scatter-adds have no fixed order."""
-    point, count = specular_lobes(normal, view, roughness), lobe_count(lobes)
-    if dr.flag(dr.JitFlag.SymbolicScope):
-        irradiance, white, grazing = _sum_over_lobes(point, lobes.array, count)
-    else:
-        irradiance, white, grazing = dr.custom(_SumOverLobes, lobes.array, count, *point)
-    return irradiance, dr.lerp(grazing, white, mi.Float(specular_albedo))
+    diffuse, white, grazing = _sums(specular_lobes(normal, view, roughness), lobes)
+    return diffuse, dr.lerp(grazing, white, mi.Float(specular_albedo))
 
 
 def shade_tensor(

@@ -178,6 +178,14 @@ def arrival(
     return Arrival(diffuse, glossy, bounced_diffuse, bounced_glossy * in_three(masking))
 
 
+def diffuse_arrival(
+    normal: "mi.TensorXf", lobes: "mi.TensorXf", directions: Directions, is_open: "mi.TensorXf"
+) -> tuple["mi.TensorXf", "mi.TensorXf"]:
+    """What `arrival` calls `diffuse` and `bounced_diffuse`, for surfaces without a specular part."""
+    cosine = _constant(directions.axis) @ normal
+    return _sums(light_radiance(lobes, directions), directions, cosine, dr.maximum(cosine, 0.0), is_open)
+
+
 def _sums(light, directions, cosine, weight, is_open):
     """Share [3, N] of `light` [3, K] that arrives under weights [K, N], and the sum [3, N] of what bounces.
 

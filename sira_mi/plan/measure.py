@@ -1,0 +1,105 @@
+"""What the decisions of a plan really cost and save: each alone, on a small picture or on some steps of a fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.fit.settings import APPEARANCE, FitSettings, Stage
+from sira_mi.plan.decisions import Decision, Plan
+from sira_mi.plan.relight import image_lobes
+from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
+from sira_mi.relight.subject import Light, Subject
+from sira_mi.sg.weak_lobes import white_radiance
+
+_SIZE = 64
+_SAMPLES = {"path": 64, "sg": 4}
+# Networks inside of path tracing are slow.
+_EXACT_SIZE, _EXACT_SAMPLES, _EXACT_REPEATS = 16, 1, 1
+_REPEATS = 3
+
+
+def measured(
+    plan: Plan, subject: Subject, light: Light, settings: RelightSettings, yaw: float, size: int = _SIZE
+) -> Plan:
+    """The plan with the error, its noise and the time saved of all that it leaves out, on a picture whose longer side
+    has `size` pixels; `settings` are those that leave nothing out."""
+
+    @cache
+    def head(exact: bool, speculars: bool):
+        return load_head(subject, replace(settings, exact=exact, speculars=speculars))
+
+    decisions = tuple(
+        _measured(d, head, subject, light, settings, yaw, size) if d.left_out and d.changes else d
+        for d in plan.decisions
+    )
+    return Plan(decisions)
+
+
+def _measured(decision: Decision, head, subject, light, settings: RelightSettings, yaw, size) -> Decision:
+    exact = "exact" in decision.changes
+    samples = _EXACT_SAMPLES if exact else _SAMPLES[settings.integrator]
+    subject = subject.scaled(_EXACT_SIZE if exact else size)
+    kept = replace(settings, samples=samples, exact=exact)
+    pictures = {}
+    for name, one in (("kept", kept), ("left out", replace(kept, **decision.changes))):
+        scene = turned_scene(head(one.exact, one.speculars), subject.camera, light, yaw, one)
+        pictures[name] = lambda scene=scene, one=one, seed=0: render_passes(scene, replace(one, seed=seed))[..., :3]
+    reference, picture, other = pictures["kept"](), pictures["left out"](), pictures["kept"](seed=1)
+    lobes = image_lobes(light.image) if light.lobes is None else light.lobes
+    white = max(white_radiance(lobes), 1e-30)
+    covered = reference.max(axis=2) > 0
+    error, noise = (
+        float(np.sqrt(((image - reference)[covered] ** 2).mean())) / white if covered.any() else 0.0
+        for image in (picture, other)
+    )
+    # Where the random numbers are the same, nothing but the decision differs.
+    same_numbers = not ({"crop"} & decision.changes.keys()) and settings.integrator == "sg"
+    repeats = _EXACT_REPEATS if exact else _REPEATS
+    saved, spread = saved_time(pictures["kept"], pictures["left out"], repeats)
+    return replace(decision, error=error, noise=0.0 if same_numbers else noise, saved=saved, saved_spread=spread)
+
+
+def measured_fit(plan: Plan, problem, settings: FitSettings, tensors: dict[str, np.ndarray]) -> Plan:
+    """The plan with the error and the time saved of all that it leaves out of the stages of an `AppearanceProblem`, at
+    the avatar tensors `tensors`."""
+    stages = {stage.name: stage for kind, stage in settings.stages if kind == APPEARANCE}
+    problem.refresh(tensors)
+
+    def gradient(stage: Stage, chosen: Plan) -> np.ndarray:
+        problem.plan = chosen
+        parameters = {name: mi.Float(tensors[name]) for name in stage.rates}
+        dr.enable_grad(*parameters.values())
+        terms = problem.losses(parameters, stage, stage.steps // 2, np.random.default_rng(0))
+        dr.backward(sum(terms.values()))
+        return np.concatenate([dr.grad(value).numpy().ravel() for value in parameters.values()])
+
+    def measure(decision: Decision) -> Decision:
+        stage = stages[decision.where]
+        kept = Plan((replace(decision, left_out=False),))
+        first, second = gradient(stage, kept), gradient(stage, Plan((decision,)))
+        error = float(np.abs(second - first).max() / max(np.abs(first).max(), 1e-30))
+        saved, spread = saved_time(lambda: gradient(stage, kept), lambda: gradient(stage, Plan((decision,))))
+        return replace(decision, error=error, saved=saved, saved_spread=spread)
+
+    return Plan(tuple(measure(d) if d.left_out and not d.built_in else d for d in plan.decisions))
+
+
+def saved_time(kept: Callable[[], object], left_out: Callable[[], object], repeats: int = _REPEATS) -> tuple:
+    """Share of the processor's time that `left_out` takes less than `kept`: the median over pairs of runs in turn,
+    after a first pair that does not count; and half the range over the pairs."""
+    shares = []
+    for _ in range(repeats + 1):
+        seconds = []
+        for run in (kept, left_out):
+            start = time.process_time()
+            run()
+            seconds.append(time.process_time() - start)
+        shares.append(1 - seconds[1] / max(seconds[0], 1e-9))
+    return float(np.median(shares[1:])), float(np.ptp(shares[1:]) / 2)

@@ -1,0 +1,425 @@
+"""What is left out: bounds against the truth, pictures and fits with and without the plan, and what imports load."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import camera, small_avatar, tiny_fit
+
+from sira_mi.errors import InputError
+from sira_mi.fit.driver import Progress, run_stages
+from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
+from sira_mi.fit.settings import APPEARANCE
+from sira_mi.models.avatar import PRIOR, load_avatar, save_avatar
+from sira_mi.plan import measure
+from sira_mi.plan.decisions import Decision, Plan, explain
+from sira_mi.plan.fit import plan_fit
+from sira_mi.plan.measure import measured, measured_fit
+from sira_mi.plan.page import commands, plan_table
+from sira_mi.plan.relight import TOLERANCE, image_lobes, largest_reflectance, plan_relight
+from sira_mi.plan.surface import Surface, bounced_radiance, sample_surface
+from sira_mi.relight.__main__ import main as relight
+from sira_mi.relight.render import RelightSettings, head_window, load_head, render_passes, turned_scene
+from sira_mi.relight.subject import Light, Subject
+from sira_mi.scene import orbited
+from sira_mi.sg.fit_environment import render_environment
+from sira_mi.sg.lights_io import write_lights
+from sira_mi.sg.lobes import fibonacci_directions
+from sira_mi.sg.shading import shade_tensor
+from sira_mi.sg.weak_lobes import needed_lobes, radiance_bounds, white_radiance
+
+# A key, a dome and three lobes that are far too dim to be seen.
+LOBES = np.array(
+    [
+        [-0.5, 0.4, 0.76, 6, 2.0, 1.8, 1.5],
+        [0.3, 0.1, 0.9, 40, 1e-4, 2e-4, 1e-4],
+        [0, 1, 0, 0.5, 0.3, 0.35, 0.4],
+        [0.9, 0.1, 0.4, 200, 1e-3, 0, 1e-3],
+        [0, 0, 1, 1e-3, 1e-5, 1e-5, 1e-5],
+    ],
+    np.float32,
+)
+SIZE = 24
+
+
+@pytest.fixture(scope="module")
+def blob(avatar, avatar_path):
+    """A nearly convex head."""
+    return Subject(Path(avatar_path), avatar, camera(40.0, SIZE))
+
+
+@pytest.fixture(scope="module")
+def mean_head(tmp_path_factory):
+    """The prior's mean head, which shadows itself, with albedo networks of the shipped sizes."""
+    prior = load_avatar(PRIOR)
+    view = camera(30.0, SIZE)
+    place = view.world_to_camera.copy()
+    place[2, 3] = 12.0
+    return Subject(PRIOR, prior, replace(camera(60.0, SIZE), world_to_camera=place))
+
+
+def everything(integrator: str, **options) -> RelightSettings:
+    """Settings that leave nothing out, but for networks inside of path tracing."""
+    return RelightSettings(integrator, **{"samples": 4, "voxel": 0.15, **options})
+
+
+def picture(subject, light, settings, yaw=0.0):
+    return render_passes(turned_scene(load_head(subject, settings), subject.camera, light, yaw, settings), settings)[
+        ..., :3
+    ]
+
+
+def by_name(plan: Plan) -> dict[str, Decision]:
+    return {d.name: d for d in plan.decisions}
+
+
+def random_directions(rng, count):
+    v = rng.standard_normal((3, count))
+    return (v / np.linalg.norm(v, axis=0)).astype(np.float32)
+
+
+def test_no_surface_reflects_more_of_a_lobe_than_the_bound():
+    """The bound of each lobe against the closed form at random points; the closed form itself errs by up to 5%."""
+    rng = np.random.default_rng(0)
+    for roughness, k_s, reflectivity in ((0.2, 1.0, 1.0), (0.5, 1.0, 0.05), (0.7, 2.0, 0.3), (0.5, 0.0, 0.5)):
+        normal, view = random_directions(rng, 2000), random_directions(rng, 2000)
+        albedo = 0.8
+        for sharpness in (1e-3, 0.5, 8.0, 300.0, 2e4):
+            lobe = np.array([[*random_directions(rng, 1)[:, 0], sharpness, 0.5, 2.0, 1.0]], np.float32)
+            tensors = [mi.TensorXf(np.ascontiguousarray(v)) for v in (normal, view)]
+            irradiance, specular = shade_tensor(
+                *tensors, mi.Float(reflectivity), mi.Float(roughness), mi.TensorXf(lobe)
+            )
+            truth = albedo / np.pi * irradiance.numpy() + k_s * specular.numpy()
+            bound = radiance_bounds(lobe, roughness, k_s, albedo, largest_reflectance(reflectivity, roughness))
+            assert truth.max() <= 1.05 * bound[0]
+            assert k_s > 0 or sharpness > 1e3 or truth.max() > 0.8 * bound[0], "far from tight"
+
+
+def test_white_is_no_brighter_than_a_surface_can_be():
+    """The unit of all errors against irradiance in many directions: never larger, and not far from it."""
+    normal = fibonacci_directions(2000).T.astype(np.float32)
+    for lobes in (LOBES, small_avatar().tensors["lobes"]):
+        irradiance, _ = shade_tensor(
+            *[mi.TensorXf(np.ascontiguousarray(normal))] * 2, mi.Float(0.0), mi.Float(0.5), mi.TensorXf(lobes)
+        )
+        largest = irradiance.numpy().max() / np.pi
+        assert 0.7 * largest < white_radiance(lobes) < 1.01 * largest
+
+
+def test_the_weakest_lobes_go_together():
+    bounds = np.array([3.0, 1e-4, 5e-4, 1.0, 3e-4])
+    assert needed_lobes(bounds, 1e-3).tolist() == [0, 3]
+    assert needed_lobes(bounds, 3.9e-4).tolist() == [0, 2, 3, 4]
+    assert needed_lobes(bounds, 100.0).tolist() == [0], "the strongest stays"
+
+
+def test_bounces_in_a_closed_room_are_powers_of_the_albedo():
+    """In a room of one albedo a whose walls shine with radiance 1, n bounces leave aⁿ, and all that follow the sum of
+    the series."""
+    rng = np.random.default_rng(1)
+    normal = random_directions(rng, 50)
+    walls = np.full((64, 50), 7)
+    room = Surface(normal, normal, np.full((3, 50), 0.5), np.zeros((1, 50)), walls)
+    parts = bounced_radiance(room, None, 0.5, 0.0, 0.0)
+    for n in range(6):
+        np.testing.assert_allclose(parts[n], 0.5 ** (n + 1), rtol=0.1)
+    np.testing.assert_allclose(parts[-1], parts[-2], rtol=0.1)
+    assert all((part == 0).all() for part in bounced_radiance(replace(room, neighbour=walls * 0 - 1), None, 0.5, 1, 1))
+
+
+def test_a_plan_is_carried_out_and_switched_off():
+    decisions = (
+        Decision(
+            "a",
+            "picture",
+            True,
+            "why",
+            1e-3,
+            changes={"max_depth": 4},
+            error=1e-4,
+            noise=1e-5,
+            saved=0.25,
+            saved_spread=0.02,
+        ),
+        Decision("b", "picture", False, "why not", changes={"visibility": False}),
+        Decision("c", "picture", True, "always", built_in=True),
+    )
+    plan = Plan(decisions)
+    settings = plan.apply(RelightSettings())
+    assert settings.max_depth == 4 and settings.visibility and plan.bound == 1e-3
+    kept = plan.keeping()
+    assert kept.apply(RelightSettings()) == RelightSettings() and kept.bound == 0
+    assert kept.leaves_out("c", "picture") and not kept.leaves_out("a", "picture")
+    text = explain(plan)
+    assert "bound 1.0e-03, measured 1.0e-04 ± 1.0e-05, 25 ± 2 % of the time saved" in text and text.count("\n") == 2
+    assert json.loads(json.dumps(plan.report()))[0]["changes"] == {"max_depth": 4}
+    assert plan_table(plan).count("\n") == 4
+
+
+def test_closed_form_pictures_with_and_without_the_plan(blob):
+    """Each decision about the closed form alone changes no pixel by more than its bound, and all together neither."""
+    light, settings = Light(LOBES), everything("sg")
+    plan = plan_relight(blob, light, load_head(blob, settings), settings, [20.0])
+    found = by_name(plan)
+    assert found["weak lobes"].changes["kept_lobes"] == (0, 2)
+    assert found["extra channels"].left_out and not found["speculars"].left_out
+    white, reference = white_radiance(LOBES), picture(blob, light, settings, 20.0)
+    for decision in plan.decisions:
+        assert not decision.left_out or decision.bound <= TOLERANCE
+        if decision.left_out and "crop" not in decision.changes:
+            changed = picture(blob, light, Plan((decision,)).apply(settings), 20.0)
+            assert np.abs(changed - reference).max() <= decision.bound * white + 1e-6, decision.name
+    planned = replace(plan.apply(settings), crop=False)
+    assert np.abs(picture(blob, light, planned, 20.0) - reference).max() <= plan.bound * white + 1e-6
+    assert (picture(blob, light, replace(planned, kept_lobes=(0,)), 20.0) != reference).any()
+
+
+def test_visibility_is_left_out_of_convex_shapes_only(blob, mean_head):
+    """Nothing of a convex shape is shadowed and the picture stays as it is; a head shadows itself under light from
+    above, and under a flash at the camera it still lights its own hollows."""
+    settings = everything("sg", samples=1)
+    decision = by_name(plan_relight(blob, Light(LOBES), load_head(blob, settings), settings, [0.0]))["visibility"]
+    assert decision.left_out and decision.bound <= TOLERANCE
+    first, second = (picture(blob, Light(LOBES), replace(settings, visibility=v)) for v in (True, False))
+    assert np.abs(first - second).max() <= decision.bound * white_radiance(LOBES) + 1e-6
+
+    shape = load_head(mean_head, settings)
+    for direction in ((0, 1, 0.3), (0, 0, 1)):
+        light = Light(np.array([[*direction, 20, 3, 3, 3]], np.float32))
+        decision = by_name(plan_relight(mean_head, light, shape, settings, [0.0]))["visibility"]
+        first, second = (picture(mean_head, light, replace(settings, visibility=v)) for v in (True, False))
+        assert not decision.left_out
+        assert np.abs(first - second).max() > TOLERANCE * white_radiance(light.lobes)
+
+
+def test_late_bounces_add_less_than_their_bound(mean_head):
+    """Path tracing to the planned depth against ten more bounces: the bound, where the tolerance is generous, is not
+    met by two bounces less."""
+    light, settings = Light(LOBES[[0, 2]]), everything("path", samples=128)
+    shape = load_head(mean_head, settings)
+    decision = by_name(plan_relight(mean_head, light, shape, settings, [0.0], tolerance=0.02))["late bounces"]
+    assert decision.left_out and 0 < decision.bound <= 0.02
+    depth = decision.changes["max_depth"]
+    assert 3 <= depth <= 9
+    white = white_radiance(light.lobes)
+    pictures = {}
+    for one in (2, depth, depth + 10):
+        scene = turned_scene(shape, mean_head.camera, light, 0.0, replace(settings, max_depth=one))
+        pictures[one] = render_passes(scene, settings)[..., :3].reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
+    lost = pictures[depth + 10] - pictures[depth]
+    assert np.abs(lost).max() <= decision.bound * white + 0.002 * white, "noise of 4608 samples a block"
+    assert (pictures[depth + 10] - pictures[2]).max() > 0.002 * white, "there are bounces"
+
+
+def test_without_speculars_nothing_of_them_is_computed(avatar, tmp_path):
+    """k_s = 0: the plan leaves the speculars out; the closed form does not change, path tracing only by its noise."""
+    save_avatar(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0))
+    matt = Subject(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0), camera(40.0, SIZE))
+    light = Light(LOBES)
+    for integrator, samples, allowed in (("sg", 4, 1e-6), ("path", 256, 0.02)):
+        settings = everything(integrator, samples=samples)
+        shape = load_head(matt, settings)
+        decision = by_name(plan_relight(matt, light, shape, settings, [0.0]))["speculars"]
+        assert decision.left_out and decision.bound == 0
+        almost = Subject(matt.path, replace(matt.avatar, k_s=1e-9), matt.camera)
+        first = picture(almost, light, settings).reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
+        second = picture(matt, light, replace(settings, speculars=False)).reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(second, first, rtol=0, atol=allowed * first.max())
+        assert first.max() > 0.1
+
+
+def test_no_ray_beside_the_window_meets_the_head(blob, mean_head):
+    """The window holds every pixel that the head covers, is not much larger, and is the whole film for a camera inside
+    the head; a picture of the window alone is the same but for its random numbers."""
+    for subject in (blob, mean_head):
+        settings = everything("sg", visibility=False)
+        shape = load_head(subject, settings)
+        for yaw in (0.0, 70.0):
+            image = render_passes(turned_scene(shape, subject.camera, Light(LOBES), yaw, settings), settings)
+            x, y, width, height = head_window(shape, orbited(subject.camera, yaw))
+            rows, columns = np.nonzero(image[..., 3] > 0)
+            assert x <= columns.min() and columns.max() < x + width and columns.min() - x < 4
+            assert y <= rows.min() and rows.max() < y + height and rows.min() - y < 4
+            cropped = turned_scene(shape, subject.camera, Light(LOBES), yaw, replace(settings, crop=True))
+            cropped = render_passes(cropped, settings)
+            assert cropped.shape == image.shape
+            both = (image[..., 3] == 1) & (cropped[..., 3] == 1)
+            assert both.sum() > 0.7 * (image[..., 3] > 0).sum()
+            difference, mean = (cropped - image)[both][:, :3], image[both][:, :3].mean()
+            assert np.abs(difference).mean() < 0.1 * mean and abs(difference.mean()) < 0.01 * mean
+    inside = camera(40.0, SIZE)
+    inside.world_to_camera[2, 3] = 0.0
+    assert head_window(shape, inside) == (0, 0, SIZE, SIZE)
+
+
+def test_an_image_is_planned_by_lobes_of_its_light():
+    """The lobes that stand for an image bring its irradiance, roughly, whatever its size."""
+    lobes = LOBES[[0, 2]]
+    normal = fibonacci_directions(200).T.astype(np.float32)
+    values = []
+    for light in (lobes, image_lobes(render_environment(lobes, 37))):
+        irradiance, _ = shade_tensor(
+            *[mi.TensorXf(np.ascontiguousarray(normal))] * 2, mi.Float(0.0), mi.Float(0.5), mi.TensorXf(light)
+        )
+        values.append(irradiance.numpy())
+    np.testing.assert_allclose(values[1], values[0], atol=0.06 * values[0].max())
+
+
+def test_what_is_measured_stays_below_its_bound(blob):
+    light, settings = Light(LOBES), everything("sg")
+    plan = plan_relight(blob, light, load_head(blob, settings), settings, [0.0])
+    for decision in measured(plan, blob, light, settings, 0.0, size=16).decisions:
+        if decision.left_out and decision.changes:
+            assert decision.error <= decision.bound + 1.5 * decision.noise + 1e-6, decision.name
+            assert decision.saved is not None
+
+
+def test_the_points_of_a_surface_repeat_and_lie_on_it(blob):
+    shape = load_head(blob, everything("sg"))
+    first, second = sample_surface(shape), sample_surface(shape)
+    for name in Surface.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert ((first.albedo >= 0) & (first.albedo <= 1)).all() and np.ptp(first.albedo) > 0.1
+    np.testing.assert_allclose(np.linalg.norm(first.normal, axis=0), 1, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """The appearance stages of a tiny fit of the example, its settings and its tensors."""
+    settings, prior = tiny_fit(steps=4), load_avatar(PRIOR)
+    settings = replace(settings, stages=tuple(s for s in settings.stages if s[0] == APPEARANCE))
+    with tempfile.TemporaryDirectory() as folder:
+        portrait = read_portrait(FitRequest(None, Path(folder), example=True), settings, prior)
+        tensors = initial_tensors(prior, 0)
+        return stage_problems(portrait, prior, PRIOR, Path(folder), settings)[APPEARANCE](tensors), settings, tensors
+
+
+def test_a_fit_with_and_without_the_plan_is_the_same(problem):
+    """What the stages leave out is 0 or was computed before: gradients and results differ by rounding at most."""
+    made, settings, tensors = problem
+    plan = plan_fit(settings)
+    taken = {(d.name, d.where) for d in plan.decisions if d.left_out and not d.built_in}
+    base = "base albedo at every step"
+    assert taken == {("speculars", "light"), ("speculars", "albedo"), (base, "light"), (base, "refinement")}
+    for decision in measured_fit(plan, made, settings, tensors).decisions:
+        assert decision.error is None or decision.error <= 1e-5, decision
+        assert (decision.error is None) == (decision.built_in or not decision.left_out)
+    results = []
+    for one in (plan, plan.keeping()):
+        made.plan = one
+        progress = Progress(dict(tensors))
+        run_stages([(lambda _: made, stage) for _, stage in settings.stages], progress, settings.block, 0, lambda _: 0)
+        results.append(progress.tensors)
+    for name, value in results[0].items():
+        np.testing.assert_allclose(value, results[1][name], rtol=0, atol=1e-5, err_msg=name)
+    assert not np.array_equal(results[0]["z_a"], tensors["z_a"])
+
+
+def test_a_changed_base_albedo_is_computed_again(problem):
+    """The base albedo of a stage that holds it is that of the tensors at hand, also after another stage moved them."""
+    made, settings, tensors = problem
+    made.plan = plan_fit(settings)
+    stage, index = settings.stages[-1][1], np.arange(10)
+    values = []
+    for z_a in (tensors["z_a"], tensors["z_a"] + 0.5):
+        made.refresh({**tensors, "z_a": z_a})
+        values.append(made._base_and_skin(made._fixed, stage, index)[0].numpy())
+        made.plan = made.plan.keeping()
+        np.testing.assert_allclose(values[-1], made._base_and_skin(made._fixed, stage, index)[0].numpy(), atol=1e-6)
+        made.plan = plan_fit(settings)
+    assert np.abs(values[0] - values[1]).max() > 1e-3
+
+
+def test_relight_explains_and_keeps_all(avatar_path, tmp_path, monkeypatch, capsys):
+    default = RelightSettings.__init__
+    monkeypatch.setitem(measure._SAMPLES, "sg", 1)
+    monkeypatch.setattr(RelightSettings, "__init__", lambda self, *a, **k: default(self, *a, **{**k, "voxel": 0.2}))
+    write_lights(tmp_path / "lights.json", LOBES)
+    common = [
+        avatar_path,
+        "--lights",
+        str(tmp_path / "lights.json"),
+        "--integrator",
+        "sg",
+        "--spp",
+        "8",
+        "--size",
+        "16",
+    ]
+    assert relight([*common, "--explain", "--out", str(tmp_path / "planned")]) == 0
+    words = capsys.readouterr().out
+    for name in ("weak lobes", "visibility", "extra channels", "pixels beside the head", "speculars", "refinement"):
+        assert name in words
+    assert "measured" in words and "time saved" in words
+    assert relight([*common, "--keep-all", "--out", str(tmp_path / "all")]) == 0
+    first, second = (np.array(mi.Bitmap(str(tmp_path / f"{name}.exr"))) for name in ("planned", "all"))
+    inside = (first.min(axis=2) > 0.05) & (second.min(axis=2) > 0.05)
+    assert inside.sum() > 20 and np.median(np.abs(first - second)[inside]) < 0.03 * second[inside].mean()
+    assert first.max() > 0.1
+
+
+HEAVY = ("mitsuba", "drjit", "numpy", "scipy", "cv2", "skimage", "trimesh", "OpenEXR", "PIL")
+
+
+def run(code: str) -> str:
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_help_loads_nothing_heavy():
+    """`--help` of every command, and `import sira_mi`, get by without Mitsuba, NumPy and what else takes its time."""
+    code = f"""
+import contextlib, io, runpy, sys
+import sira_mi
+for name in {commands()}:
+    sys.argv = [name, "--help"]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as text:
+        runpy.run_module(f"sira_mi.{{name}}", run_name="__main__")
+    assert "usage" in text.getvalue(), name
+    loaded = [m for m in {HEAVY} if m in sys.modules]
+    assert not loaded, (name, loaded)
+print("fine")
+"""
+    assert len(commands()) >= 7 and run(code).strip() == "fine"
+
+
+def test_plugins_load_no_more_than_they_use():
+    """A variant with all plugins needs no optimiser, no image library and no mesh library."""
+    code = """
+import sys, sira_mi, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+mi.load_dict({"type": "sg_envmap"}), mi.load_dict({"type": "sira_bsdf"}), mi.load_dict({"type": "sira_sg"})
+print(*(m for m in ("scipy", "cv2", "skimage", "trimesh", "tqdm") if m in sys.modules))
+"""
+    assert run(code).split() == []
+
+
+@pytest.mark.parametrize("first", ["sira_mi", "mitsuba", "sira_mi.plugins"])
+def test_plugins_are_there_whichever_is_imported_first(first):
+    code = f"""
+import {first}
+import mitsuba as mi
+import sira_mi
+for variant in ("scalar_rgb", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+print(mi.load_dict({{"type": "sg_envmap"}}))
+"""
+    assert "SGEnvmap" in run(code)
+
+
+def test_numbers_of_lobes_are_checked():
+    """`sira_sg` refuses numbers of lobes that the light does not have."""
+    for numbers in ([5], [-1], [0, 7]):
+        integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array(numbers, np.float32))})
+        with pytest.raises(InputError, match="numbers of lobes"):
+            integrator._shaded(mi.TensorXf(LOBES))
+    integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array([2, 0], np.float32))})
+    np.testing.assert_array_equal(integrator._shaded(mi.TensorXf(LOBES)).numpy(), LOBES[[2, 0]])
