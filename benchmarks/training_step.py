@@ -34,6 +34,7 @@ def random_scene(seed: int, points: int = 2000) -> TrainingScene:
     return TrainingScene(
         points=normals,
         normals=normals,
+        region=np.zeros(points, np.uint8),
         volume=volume,
         volume_distance=(np.linalg.norm(volume, axis=1) - 1).astype(np.float32),
         landmarks=normals[:468],

@@ -235,6 +235,7 @@ def scene(model, surface_points, true_latents):
     return TrainingScene(
         points=surface_points,
         normals=inputs[2].T,
+        region=np.zeros(len(surface_points), np.uint8),
         volume=surface_points,
         volume_distance=np.zeros(len(surface_points), np.float32),
         landmarks=landmarks,

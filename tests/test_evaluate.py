@@ -50,6 +50,7 @@ def scan_of(model, w, w_r, seed: int) -> Scan:
     scene = TrainingScene(
         points=points,
         normals=normals.T,
+        region=np.zeros(len(points), np.uint8),
         volume=np.zeros((1, 3), np.float32),
         volume_distance=np.zeros(1, np.float32),
         landmarks=np.full((468, 3), np.nan, np.float32),
@@ -104,7 +105,18 @@ def test_distance_to_a_scan_is_that_to_its_discs():
 def plate(points) -> Scan:
     empty = np.zeros((0, 3), np.float32)
     normals = np.repeat([[0.0, 1.0, 0.0]], len(points), axis=0)
-    scene = TrainingScene(points, normals, empty, empty[:, 0], empty, empty[:, 0], empty[:, 0], empty, empty)
+    scene = TrainingScene(
+        points,
+        normals,
+        np.zeros(len(points), np.uint8),
+        empty,
+        empty[:, 0],
+        empty,
+        empty[:, 0],
+        empty[:, 0],
+        empty,
+        empty,
+    )
     return Scan("plate", {}, scene, np.zeros(len(points), bool), np.zeros(3))
 
 

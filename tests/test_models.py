@@ -149,6 +149,7 @@ def ball_scene(radius: float, color, seed: int) -> TrainingScene:
     return TrainingScene(
         points=(radius * normals).astype(np.float32),
         normals=normals.astype(np.float32),
+        region=(normals[:, 1] < 0) * np.uint8(3),
         volume=volume.astype(np.float32),
         volume_distance=(np.linalg.norm(volume, axis=1) - radius).astype(np.float32),
         landmarks=landmarks.astype(np.float32),
@@ -265,6 +266,21 @@ def test_appearance_training_lowers_the_loss(appearance):
     assert all(np.isfinite(v).all() for v in parameters.values())
 
 
+def test_the_specular_albedo_is_held_near_the_level_of_its_region(shape, two_scenes):
+    """Where the decoder says 0.03 everywhere, the anchor is ln² of the factor that a region's level is off."""
+    settings = dataclasses.replace(APPEARANCE, specular_levels=(0.03, 0.02, 0.07, 0.008))
+    rng = np.random.default_rng(0)
+    frozen = af_sm.freeze_scene(SMALL, shape[0], shape[0]["z_sdf"][:, 0], two_scenes[0], settings, rng)
+    model = af_sm.initial_appearance_model(SMALL, 1, 0)
+    model["specular_albedo"] = np.zeros_like(model["specular_albedo"])
+    values = {k: mi.TensorXf(v) if v.ndim == 2 else mi.Float(v) for k, v in model.items()}
+    batch = af_sm.draw_batch([frozen], settings, np.random.default_rng(0))
+    cloth = (batch.specular_level.numpy() == np.float32(0.008)).mean()
+    assert 0.2 < cloth < 0.8
+    found = af_sm.appearance_losses(SMALL, settings, values, batch)["specular_anchor"].numpy().item()
+    assert found == pytest.approx(cloth * np.log(0.03 / 0.008) ** 2, rel=1e-4)
+
+
 def test_appearance_training_resumes_to_the_same_bits(appearance, shape, two_scenes, tmp_path):
     train_appearance(tmp_path, two_scenes, shape[0], until=11)
     resumed, seen = train_appearance(tmp_path, two_scenes, shape[0])
@@ -342,6 +358,7 @@ def scene_file(path):
         normals=random(3, 3),
         volume=random(4, 3),
         volume_distance=random(4),
+        region=np.zeros(3, np.uint8),
         landmarks=random(468, 3),
         landmarks_valid=np.arange(468) % 2 == 0,
         visible=visible,

@@ -19,6 +19,7 @@ from sira_mi.models.avatar import AvatarArchitecture, signed_distance_field
 from sira_mi.models.scenes import TrainingScene
 from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_radiance, skin_tone_loss
 from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.sg.shading import irradiance as irradiance_of
 from sira_mi.sg.shading import shade
 from sira_mi.sg.visibility import received
 
@@ -40,7 +41,15 @@ class AppearanceTraining:
     jitter: float = 0.015  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
     smoothness: float = 0.01  # λ7 (NeRFactor 0.05)
-    specular_anchor: float = 0.01  # pull of the log specular albedo to that of skin, which images hardly determine
+    specular_anchor: float = 0.01  # pull of the log specular albedo to the level of its region, which images hardly
+    # determine
+    specular_levels: tuple[float, ...] = (
+        SKIN_SPECULAR,
+        0.024,
+        0.07,
+        0.008,
+    )  # of skin, hair, eye and cloth: reflectance
+    # at normal incidence, skin's by FLARE, the others those of the collection
     white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
     skin_tone: float = 1e-3  # on the deviations of a face's skin albedo from measured skin, which settles the
     # level and colour of the light against the albedo's
@@ -56,6 +65,7 @@ class FrozenScene:
     x_ref: np.ndarray  # [3, P]
     gamma: np.ndarray  # [N_γ, P]
     normals: np.ndarray  # [3, P] unit, of the field
+    specular_level: np.ndarray  # [1, P] of the points' regions
     jittered_x_ref: np.ndarray  # [3, P] at x + ε
     jittered_gamma: np.ndarray  # [N_γ, P]
     skin_x_ref: np.ndarray  # [3, L] at `SKIN_LANDMARKS`
@@ -95,6 +105,7 @@ def freeze_scene(
         x_ref,
         gamma,
         gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6),
+        np.array(settings.specular_levels, np.float32)[None, scene.region[chosen]],
         jittered_x_ref,
         jittered_gamma,
         skin_x_ref,
@@ -129,6 +140,7 @@ class AppearanceBatch:
     x_ref: mi.TensorXf  # [3, S·n]
     gamma: mi.TensorXf
     normals: mi.TensorXf
+    specular_level: mi.TensorXf  # [1, S·n]
     jittered_x_ref: mi.TensorXf
     jittered_gamma: mi.TensorXf
     skin_x_ref: mi.TensorXf  # [3, S·L]
@@ -142,7 +154,7 @@ class AppearanceBatch:
 def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.random.Generator) -> AppearanceBatch:
     """A random batch of observations."""
     chosen = np.sort(rng.choice(len(scenes), min(settings.scenes, len(scenes)), replace=False))
-    names = ("x_ref", "gamma", "normals", "jittered_x_ref", "jittered_gamma")
+    names = ("x_ref", "gamma", "normals", "specular_level", "jittered_x_ref", "jittered_gamma")
     skin = ("skin_x_ref", "skin_gamma", "skin_weight")
     parts: dict[str, list] = {name: [] for name in (*names, *skin, "views", "colors")}
     for k in chosen:
@@ -181,6 +193,15 @@ def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes, a
     return albedo * irradiance * (1 / np.pi), specular_radiance * k_s
 
 
+def diffuse_radiance(albedo, normals, lobes, arrival=None):
+    """The diffuse part of `physical_radiance` [3, N]; `arrival` is that of `sg.visibility.diffuse_arrival`."""
+    irradiance = to_columns(irradiance_of(from_columns(normals, mi.Vector3f), lobes))
+    if arrival is not None:
+        share, bounced = arrival
+        irradiance = irradiance * share + bounced * albedo
+    return albedo * irradiance * (1 / np.pi)
+
+
 def appearance_losses(architecture, settings: AppearanceTraining, parameters: dict, batch: AppearanceBatch) -> dict:
     """Every term of eq. 10 and the anchors, unweighted, by the names of `AppearanceTraining`."""
     z_a, z_s, z_l = (parameters[name] @ batch.scenes for name in LATENTS)
@@ -203,7 +224,7 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     radiance = albedo * to_columns(irradiance) * (1 / np.pi) + to_columns(specular_radiance)
     skin = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.skin_x_ref, batch.skin_gamma)
     difference = albedo - moved
-    anchor = dr.log(specular * (1 / SKIN_SPECULAR))
+    anchor = dr.log(specular / batch.specular_level)
     amplitude = dr.log(lobes[:, 4:7, :])
     grey = amplitude - in_three(dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count)), axis=1)
     return {

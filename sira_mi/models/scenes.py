@@ -17,6 +17,7 @@ from sira_mi.errors import InputError
 _ARRAYS = (
     "points",
     "normals",
+    "region",
     "volume",
     "volume_distance",
     "landmarks",
@@ -33,6 +34,7 @@ class TrainingScene:
 
     points: np.ndarray  # [P, 3] on the visible surface
     normals: np.ndarray  # [P, 3] unit
+    region: np.ndarray  # [P] uint8: 0 skin, 1 hair, 2 eye, 3 cloth
     volume: np.ndarray  # [Q, 3] points of known signed distance
     volume_distance: np.ndarray  # [Q], positive outside
     landmarks: np.ndarray  # [468, 3], NaN where unknown
@@ -61,6 +63,7 @@ def load_scene(path: Path) -> TrainingScene:
     return TrainingScene(
         points=data["points"].astype(np.float32),
         normals=data["normals"].astype(np.float32),
+        region=data["region"].astype(np.uint8),
         volume=data["volume"].astype(np.float32),
         volume_distance=data["volume_distance"].astype(np.float32),
         landmarks=np.where(data["landmarks_valid"][:, None], data["landmarks"], np.nan).astype(np.float32),

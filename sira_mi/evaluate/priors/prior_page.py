@@ -348,7 +348,7 @@ From the left: an unseen view, its re-rendering, true albedo, fitted albedo, the
 APPEARANCE_PURPOSES = {
     "embedding": "keeps the latents small",
     "smoothness": "keeps the albedo smooth",
-    "specular_anchor": "holds the specular albedo near skin's",
+    "specular_anchor": "holds the specular albedo near its region's level",
     "white_light": "settles the colour of light against albedo",
     "skin_tone": "settles the level of light against albedo",
 }
