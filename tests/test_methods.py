@@ -38,6 +38,7 @@ def test_ablations_are_those_of_the_paper():
     assert moved("b.1") == {"illumination", "diffuse_albedo", "specular_albedo"}
     assert "albedo_refinement" not in moved("b.2") and "albedo_refinement" in moved("b.3")
     assert "deformation" not in moved("b.3") and "deformation" in moved("b.4")
+    assert moved("b.5") == {"z_l", "illumination", "z_s", "albedo_refinement"}
     assert [kind for kind, _ in BY_NAME["b.4"].settings(DRAFT).stages].count(RELIEF) == 1
     assert not BY_NAME["a.1"].deforms and BY_NAME["a.2"].settings(DRAFT).geometry.stay == 0
 
@@ -160,10 +161,13 @@ def test_results_page_says_what_is_reached_and_what_is_missed(tmp_path, monkeypa
     (tmp_path / "images").mkdir()
     monkeypatch.setattr(results_page, "picture", lambda *arguments: np.zeros((4, 4, 3)))
     failed = {"portrait": "p2", "identity": "i2", "light": "studio", "method": "a.3", "error": "no face found"}
-    page = results_page.write_results([*rows(), failed], tmp_path, tmp_path, tmp_path, "draft").read_text()
+    described = results_page.Described(tmp_path, tmp_path, "standard", "draft")
+    page = results_page.write_results(rows(), [*rows(), failed], described, tmp_path).read_text()
     assert "| face, both directions, mm | ≤ 1.0 | 0.85 | reached |" in page
     assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in page
     assert "| final render, dB | ≥ 34 | 0.8 | missed |" in page
+    assert "| a.4 minus the best of a.1 to a.3, mm | ≤ 0 | – | – |" in page
+    assert "| time of a fit, s | ≤ 300 | 41 | reached |" in page
     assert "| p2 | a.3 | no face found |" in page
     assert (tmp_path / "images" / "results.png").exists()
 

@@ -10,8 +10,6 @@ import argparse
 import time
 from pathlib import Path
 
-import mitsuba as mi
-
 from sira_mi.errors import InputError, run_command
 
 
@@ -41,8 +39,11 @@ def main() -> None:
     fits.add_argument("--benchmark", type=Path, required=True)
     fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
     fits.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
-    fits.add_argument("--quality", choices=("draft", "standard", "high"), default="standard")
-    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods (default: all, a.1 to b.3)")
+    fits.add_argument("--quality", choices=("draft", "standard", "high"), default="standard", help="of the shipped fit")
+    fits.add_argument(
+        "--ablations", choices=("draft", "standard", "high"), default="draft", help="quality of all methods"
+    )
+    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.1 to b.5)")
     fits.add_argument(
         "--portraits", nargs="+", default=(), metavar="NAME", help="portraits (default: the primary ones)"
     )
@@ -57,13 +58,15 @@ def main() -> None:
         return compare_fits(arguments)
     if arguments.steps < 0:
         raise InputError("a number of steps is 0 (train nothing) or more")
-    mi.set_variant(arguments.variant)
+
+    import mitsuba as mi
 
     from sira_mi.evaluate.priors.ablations import run_ablations, run_sizes
     from sira_mi.evaluate.priors.appearance_evidence import measure_appearance_prior, run_appearance_ablations
     from sira_mi.evaluate.priors.prior_page import write_page
     from sira_mi.evaluate.priors.shape_evidence import measure_shape_prior
 
+    mi.set_variant(arguments.variant)
     evidence = arguments.runs / "evidence"
     start = time.monotonic()
     if arguments.command == "prior":
@@ -80,27 +83,37 @@ def main() -> None:
 
 def compare_fits(arguments: argparse.Namespace) -> None:
     """Fits and scores the benchmark's portraits as the command line says, and writes the page."""
-    mi.set_variant(arguments.variant)
+    import mitsuba as mi
+
     from sira_mi.evaluate.portraits.fits import Comparison, compare, write_rows
     from sira_mi.evaluate.portraits.methods import BY_NAME
-    from sira_mi.evaluate.portraits.results_page import write_results
+    from sira_mi.evaluate.portraits.results_page import SHIPPED, Described, write_results
     from sira_mi.models.avatar import PRIOR
 
-    comparison = Comparison(
-        arguments.benchmark,
-        arguments.runs,
-        arguments.quality,
-        tuple(arguments.methods or BY_NAME),
-        arguments.prior or PRIOR,
-        arguments.prior_without_deformation,
-        primary=not arguments.all_lights,
-        only=tuple(arguments.portraits),
-        variant=arguments.variant,
+    mi.set_variant(arguments.variant)
+
+    def rows(quality: str, methods: tuple[str, ...]) -> list[dict]:
+        comparison = Comparison(
+            arguments.benchmark,
+            arguments.runs / quality,
+            quality,
+            methods,
+            arguments.prior or PRIOR,
+            arguments.prior_without_deformation,
+            primary=not arguments.all_lights,
+            only=tuple(arguments.portraits),
+            variant=arguments.variant,
+        )
+        found = compare(comparison)
+        write_rows(arguments.runs / f"{quality}.json", found)
+        return found
+
+    ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
+    shipped = rows(arguments.quality, (SHIPPED,))
+    described = Described(
+        arguments.benchmark, arguments.runs / arguments.quality, arguments.quality, arguments.ablations
     )
-    rows = compare(comparison)
-    write_rows(arguments.runs / "rows.json", rows)
-    page = write_results(rows, arguments.benchmark, arguments.runs, arguments.out, arguments.quality)
-    print(f"{page} written")
+    print(f"{write_results(shipped, ablations, described, arguments.out)} written")
 
 
 def make_benchmark(arguments: argparse.Namespace) -> None:

@@ -14,10 +14,17 @@ def main() -> int:
     parser.add_argument("--quality", choices=("draft", "standard", "high"), default="standard")
     parser.add_argument("--seed", type=int, default=0, help="of everything random; the same seed repeats a fit")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the output folder")
+    parser.add_argument(
+        "--polish",
+        action="store_true",
+        help="at last refine albedo and light by path tracing; repeats up to the last bits only",
+    )
     parser.add_argument("--mask", type=Path, help="foreground mask image of the photo's size")
     parser.add_argument("--camera", type=Path, help="camera.json: K, world_to_camera, width, height (OpenCV)")
     parser.add_argument("--face", type=int, help="which face, counted from 0 by size (default: the largest)")
     parser.add_argument("--prior", type=Path, help="prior.safetensors instead of the shipped one")
+    parser.add_argument("--explain", action="store_true", help="say what the stages leave out, and measure it")
+    parser.add_argument("--keep-all", action="store_true", help="leave nothing out")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
     arguments = parser.parse_args()
     if (arguments.photo is None) == (not arguments.example):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-GEOMETRY, APPEARANCE, RELIEF = "geometry", "appearance", "relief"
+GEOMETRY, APPEARANCE, RELIEF, POLISH = "geometry", "appearance", "relief", "polish"
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,16 @@ class ReliefWeights:
 
 
 @dataclass(frozen=True)
+class PolishSettings:
+    """Of the polish stage."""
+
+    color: float = 1.0  # weight of the error of the path-traced picture
+    size: int = 128  # longest side of the head's picture, pixels
+    samples: int = 16  # paths a pixel, of the picture and again of its derivative; a power of 4
+    depth: int = 6  # most segments of a path; 2 is direct light
+
+
+@dataclass(frozen=True)
 class FitSettings:
     """A whole fit."""
 
@@ -62,29 +72,46 @@ class FitSettings:
     pixels: int  # of the appearance stages, a step
     voxel: float  # of the mesh during the fit, scene units
     final_voxel: float  # of the exported mesh, scene units
-    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY, APPEARANCE or RELIEF, stage), in order
+    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY, APPEARANCE, RELIEF or POLISH, stage), in order
     geometry: GeometryWeights = field(default_factory=GeometryWeights)
     appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
     relief: ReliefWeights = field(default_factory=ReliefWeights)
+    polish: PolishSettings = field(default_factory=PolishSettings)
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
-def _stages(scale: float) -> tuple[tuple[str, Stage], ...]:
-    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to `scale`."""
+def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]:
+    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales. Geometry that is fitted for
+    longer follows the photo further from the prior, and not nearer to the person."""
+
+    def shape_steps(count: int) -> int:
+        return round(count * geometry)
 
     def steps(count: int) -> int:
-        return max(20, round(count * scale))
+        return round(count * appearance)
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
     return (
-        (GEOMETRY, Stage("latents", steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
+        (GEOMETRY, Stage("latents", shape_steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
         (
             GEOMETRY,
-            Stage("networks", steps(240), _rates(shape, 6e-3, networks, 4e-4, 2e-3), mask_sharpness=60, landmark=0.25),
+            Stage(
+                "networks",
+                shape_steps(240),
+                _rates(shape, 6e-3, networks, 4e-4, 2e-3),
+                mask_sharpness=60,
+                landmark=0.25,
+            ),
         ),
         (
             GEOMETRY,
-            Stage("details", steps(120), _rates(shape, 2e-3, networks, 1.5e-4, 1e-3), mask_sharpness=240, landmark=0.1),
+            Stage(
+                "details",
+                shape_steps(120),
+                _rates(shape, 2e-3, networks, 1.5e-4, 1e-3),
+                mask_sharpness=240,
+                landmark=0.1,
+            ),
         ),
         (APPEARANCE, Stage("light", steps(120), {"z_l": 1e-1, "illumination": 1e-3})),
         (APPEARANCE, Stage("albedo", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 1e-1})),
@@ -116,6 +143,12 @@ def with_relief(stages: tuple[tuple[str, Stage], ...], steps: int) -> tuple[tupl
     return (*stages[:first], (RELIEF, stage), *stages[first:])
 
 
+def polish_stage(steps: int = 30) -> tuple[str, Stage]:
+    """The stage that may follow all others: albedo and light by path tracing."""
+    rates = {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 2e-3}
+    return POLISH, Stage("polish", steps, rates, k_s=(1.0, 1.0), k_r=1.0)
+
+
 def _rates(first: tuple, first_rate: float, second: tuple, second_rate: float, pose_rate: float) -> dict[str, float]:
     return {**dict.fromkeys(first, first_rate), **dict.fromkeys(second, second_rate), "pose": pose_rate}
 
@@ -130,7 +163,7 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 
 QUALITIES = {
-    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(1.0)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(2.5)),
+    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.35)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5)),
 }

@@ -71,7 +71,11 @@ def _complete(names: Sequence[str]) -> list[str]:
     """The methods and those that they go on from, in the order of `METHODS`."""
     if unknown := set(names) - set(BY_NAME):
         raise InputError(f"unknown methods {', '.join(sorted(unknown))}; known are {', '.join(BY_NAME)}")
-    wanted = set(names) | {BY_NAME[name].after for name in names}
+    wanted: set[str | None] = set()
+    for name in names:
+        while name not in wanted and name is not None:
+            wanted.add(name)
+            name = BY_NAME[name].after
     return [method.name for method in METHODS if method.name in wanted]
 
 

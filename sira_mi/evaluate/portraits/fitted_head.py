@@ -53,7 +53,7 @@ def fit_and_write(job: Job) -> dict:
     return {
         "seconds": {**seconds, **{k: round(v, 2) for k, v in progress.seconds.items()}},
         "losses": progress.losses,
-        "notes": list(portrait.notes),
+        "notes": [*portrait.notes, *progress.notes],
     }
 
 

@@ -2,7 +2,7 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is the fit as it ships, with the refinement, and b.4 adds a relief stage.
+schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, and b.5 a polish after b.3.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage, with_relief
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage, polish_stage, with_relief
 from sira_mi.models.af_sm import initial_appearance_model
 from sira_mi.models.avatar import Avatar
 
@@ -118,5 +118,6 @@ METHODS = (
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
     Method("b.3", "with refinement: the shipped fit", _of_kind(APPEARANCE), _unchanged, after="a.4"),
     Method("b.4", "with a relief stage", _with_relief, _unchanged, after="a.4"),
+    Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
 )
 BY_NAME = {method.name: method for method in METHODS}

@@ -13,6 +13,9 @@ from sira_mi.evaluate.portraits.methods import BY_NAME
 from sira_mi.files import write_png, write_through
 from sira_mi.fit import output
 
+SHIPPED = "b.3"
+GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", "b.4")
+APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5")
 _TILE = 256  # pixels, side of a picture in the sheet
 _SHEET_PORTRAITS = 6
 
@@ -54,12 +57,30 @@ APPEARANCE_COLUMNS = (
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Rows by method: those of the shipped fit at the quality of the page, and all methods at that of the ablations."""
+
+    shipped: dict[str, list[dict]]
+    ablations: dict[str, list[dict]]
+
+
+@dataclass(frozen=True)
+class Described:
+    """Where the rows of a page come from."""
+
+    benchmark: Path
+    runs: Path  # folder of the shipped fits
+    quality: str  # of the shipped fits
+    ablations: str  # quality of the ablations
+
+
+@dataclass(frozen=True)
 class Mark:
     """What the shipped fit has to reach."""
 
     title: str
     wanted: str
-    score: Callable[[dict[str, Sequence[dict]]], float]  # of the rows by method
+    score: Callable[[Measured], float]
     met: Callable[[float], bool]
     digits: int = 2
 
@@ -69,17 +90,38 @@ def mean(rows: Sequence[dict], score: str) -> float:
     return float(np.mean([row["scores"][score] if "scores" in row else np.nan for row in rows])) if rows else np.nan
 
 
-def _of(method: str, score: str) -> Callable[[dict], float]:
-    return lambda rows: mean(rows.get(method, ()), score)
+def _shipped(score: str) -> Callable[[Measured], float]:
+    return lambda measured: mean(measured.shipped.get(SHIPPED, ()), score)
 
 
-def _over_mean_head(rows: dict) -> float:
-    return mean(rows.get("b.3", ()), "h3ds_face_mean") / mean(rows.get(MEAN_HEAD, ()), "h3ds_face_mean")
+def _over_mean_head(measured: Measured) -> float:
+    rows = measured.shipped
+    return mean(rows.get(SHIPPED, ()), "h3ds_face_mean") / mean(rows.get(MEAN_HEAD, ()), "h3ds_face_mean")
 
 
-def _best_ablation(rows: dict) -> float:
-    others = [mean(rows.get(name, ()), "h3ds_face_mean") for name in ("a.1", "a.2", "a.3")]
-    return mean(rows.get("a.4", ()), "h3ds_face_mean") - min(others)
+def _best_ablation(measured: Measured) -> float:
+    others = [mean(measured.ablations.get(name, ()), "h3ds_face_mean") for name in ("a.1", "a.2", "a.3")]
+    return mean(measured.ablations.get("a.4", ()), "h3ds_face_mean") - min(others)
+
+
+def _draft_face(measured: Measured) -> float:
+    return mean(measured.ablations.get(SHIPPED, ()), "h3ds_face_mean")
+
+
+def seconds(rows: dict[str, list[dict]]) -> float:
+    """Median time of whole shipped fits: geometry and what goes on from it."""
+    geometry = {row["portrait"]: row["total_seconds"] for row in rows.get("a.4", ()) if "scores" in row}
+    both = [
+        geometry[row["portrait"]] + row["total_seconds"]
+        for row in rows.get(SHIPPED, ())
+        if "scores" in row and row["portrait"] in geometry
+    ]
+    return float(np.median(both)) if both else np.nan
+
+
+def _memory(measured: Measured) -> float:
+    rows = [row for name in ("a.4", SHIPPED) for row in measured.shipped.get(name, ()) if "scores" in row]
+    return max((row["peak_memory_megabytes"] / 1000 for row in rows), default=np.nan)
 
 
 def at_most(limit: float) -> Callable[[float], bool]:
@@ -91,18 +133,22 @@ def at_least(limit: float) -> Callable[[float], bool]:
 
 
 MARKS = (
-    Mark("face, both directions, mm", "≤ 1.0", _of("b.3", "h3ds_face_mean"), at_most(1.0)),
+    Mark("face, both directions, mm", "≤ 1.0", _shipped("h3ds_face_mean"), at_most(1.0)),
     Mark("the same over the mean head's", "≤ 0.7", _over_mean_head, at_most(0.7)),
-    Mark("face in the photo's camera frame, no ICP, mm", "≤ 1.5", _of("b.3", "camera_face_mean"), at_most(1.5)),
-    Mark("face normals, °", "≤ 8", _of("b.3", "normals_mean"), at_most(8), 1),
+    Mark("face in the photo's camera frame, no ICP, mm", "≤ 1.5", _shipped("camera_face_mean"), at_most(1.5)),
+    Mark("face normals, °", "≤ 8", _shipped("normals_mean"), at_most(8), 1),
     Mark("a.4 minus the best of a.1 to a.3, mm", "≤ 0", _best_ablation, at_most(0)),
-    Mark("silhouette IoU", "≥ 0.97", _of("b.3", "silhouette_iou"), at_least(0.97), 3),
-    Mark("final render, dB", "≥ 34", _of("b.3", "final_psnr"), at_least(34), 1),
-    Mark("final render, SSIM", "≥ 0.95", _of("b.3", "final_ssim"), at_least(0.95)),
-    Mark("diffuse albedo, dB", "≥ 23", _of("b.3", "diffuse_psnr"), at_least(23), 1),
-    Mark("diffuse albedo, SSIM", "≥ 0.88", _of("b.3", "diffuse_ssim"), at_least(0.88)),
-    Mark("specular albedo, dB", "≥ 19.5", _of("b.3", "specular_psnr"), at_least(19.5), 1),
-    Mark("specular albedo, SSIM", "≥ 0.71", _of("b.3", "specular_ssim"), at_least(0.71)),
+    Mark("silhouette IoU", "≥ 0.97", _shipped("silhouette_iou"), at_least(0.97), 3),
+    Mark("final render, dB", "≥ 34", _shipped("final_psnr"), at_least(34), 1),
+    Mark("final render, SSIM", "≥ 0.95", _shipped("final_ssim"), at_least(0.95), 3),
+    Mark("diffuse albedo, dB", "≥ 23", _shipped("diffuse_psnr"), at_least(23), 1),
+    Mark("diffuse albedo, SSIM", "≥ 0.88", _shipped("diffuse_ssim"), at_least(0.88), 3),
+    Mark("specular albedo, dB", "≥ 19.5", _shipped("specular_psnr"), at_least(19.5), 1),
+    Mark("specular albedo, SSIM", "≥ 0.71", _shipped("specular_ssim"), at_least(0.71), 3),
+    Mark("time of a fit, s", "≤ 300", lambda measured: seconds(measured.shipped), at_most(300), 0),
+    Mark("its peak memory, GB", "≤ 2", _memory, at_most(2), 1),
+    Mark("time of a draft, s", "≤ 60", lambda measured: seconds(measured.ablations), at_most(60), 0),
+    Mark("face of a draft, mm", "≤ 1.2", _draft_face, at_most(1.2)),
 )
 
 
@@ -114,34 +160,40 @@ def by_method(rows: Sequence[dict]) -> dict[str, list[dict]]:
     return result
 
 
-def write_results(rows: Sequence[dict], benchmark: Path, runs: Path, out: Path, quality: str) -> Path:
+def write_results(shipped: Sequence[dict], ablations: Sequence[dict], described: Described, out: Path) -> Path:
     """Writes `results.md` and its picture to the folder `out`; returns the page."""
-    methods = by_method(rows)
+    measured = Measured(by_method(shipped), by_method(ablations))
+    fits, methods = measured.shipped, measured.ablations
     sections = [
-        _INTRODUCTION.format(portraits=len(methods[MEAN_HEAD]), quality=quality),
-        "## Marks\n\n" + _marks(methods),
-        "## Geometry\n\n" + _GEOMETRY_TEXT + "\n\n" + _methods_table(methods, GEOMETRY_COLUMNS, shaded=False),
-        "## Appearance\n\n" + _APPEARANCE_TEXT + "\n\n" + _methods_table(methods, APPEARANCE_COLUMNS, shaded=True),
-        "## By light\n\n" + _by_light(methods),
-        "## Every portrait\n\n" + _by_portrait(methods),
-        "## Time and memory\n\n" + _costs(methods),
+        _INTRODUCTION.format(portraits=len(fits[MEAN_HEAD]), quality=described.quality),
+        "## Marks\n\n" + _marks(measured),
+        "## Geometry\n\n" + _GEOMETRY_TEXT + "\n\n" + _methods_table(fits, GEOMETRY_COLUMNS, GEOMETRY_ROWS),
+        "## Appearance\n\n" + _APPEARANCE_TEXT + "\n\n" + _methods_table(fits, APPEARANCE_COLUMNS, (SHIPPED,)),
+        _ABLATIONS_TEXT.format(quality=described.ablations)
+        + _methods_table(methods, GEOMETRY_COLUMNS, GEOMETRY_ROWS)
+        + "\n\n"
+        + _methods_table(methods, APPEARANCE_COLUMNS, APPEARANCE_ROWS),
+        "## By light\n\n" + _by_light(fits),
+        "## Every portrait\n\n" + _by_portrait(fits),
+        f"## Time and memory\n\n{_COSTS_TEXT}\n\nAt `{described.quality}`:\n\n{_costs(fits)}\n\n"
+        f"At `{described.ablations}`:\n\n{_costs(methods)}",
     ]
-    if errors := [row for row in rows if "error" in row]:
+    if errors := [row for row in (*shipped, *ablations) if "error" in row]:
         lines = [[row["portrait"], row["method"], row["error"]] for row in errors]
         sections.append("## Fits that failed\n\n" + table(("portrait", "method", "error"), lines))
-    if "b.3" in methods:
-        shown = [row["portrait"] for row in methods["b.3"] if "scores" in row][:_SHEET_PORTRAITS]
-        write_png(out / "images" / "results.png", picture(shown, benchmark, runs))
+    shown = [row["portrait"] for row in fits.get(SHIPPED, ()) if "scores" in row][:_SHEET_PORTRAITS]
+    if shown:
+        write_png(out / "images" / "results.png", picture(shown, described.benchmark, described.runs))
         sections.append(_PICTURE_TEXT)
     page = out / "results.md"
     write_through(page, lambda file: file.write_text("\n\n".join(sections) + "\n", encoding="utf-8"))
     return page
 
 
-def _marks(methods: dict) -> str:
+def _marks(measured: Measured) -> str:
     lines = []
     for mark in MARKS:
-        value = mark.score(methods)
+        value = mark.score(measured)
         verdict = "–" if np.isnan(value) else ("reached" if mark.met(value) else "missed")
         lines.append([mark.title, mark.wanted, number(value, mark.digits), verdict])
     return table(("", "to reach", "measured", ""), lines)
@@ -151,21 +203,18 @@ def _title(method: str) -> str:
     return method if method == MEAN_HEAD else f"{method} {BY_NAME[method].title}"
 
 
-def _methods_table(methods: dict, columns: Sequence[Column], shaded: bool) -> str:
-    lines = []
-    for name, rows in methods.items():
-        if shaded == (name != MEAN_HEAD and BY_NAME[name].after is not None):
-            lines.append([_title(name), *(number(mean(rows, c.score), c.digits) for c in columns)])
-    if not shaded and "b.4" in methods:
-        lines.append(
-            ["b.4, after its relief stage", *(number(mean(methods["b.4"], c.score), c.digits) for c in columns)]
-        )
+def _methods_table(methods: dict, columns: Sequence[Column], names: Sequence[str]) -> str:
+    lines = [
+        [_title(name), *(number(mean(methods[name], c.score), c.digits) for c in columns)]
+        for name in names
+        if name in methods
+    ]
     return table(("", *(c.title for c in columns)), lines)
 
 
 def _by_light(methods: dict) -> str:
     columns = (*GEOMETRY_COLUMNS[:1], *GEOMETRY_COLUMNS[5:6], *GEOMETRY_COLUMNS[8:], *APPEARANCE_COLUMNS)
-    rows = methods.get("b.3", [])
+    rows = methods.get(SHIPPED, [])
     lights = sorted({row["light"] for row in rows})
     lines = [
         [light, *(number(mean([r for r in rows if r["light"] == light], c.score), c.digits) for c in columns)]
@@ -177,7 +226,7 @@ def _by_light(methods: dict) -> str:
 def _by_portrait(methods: dict) -> str:
     heads = {row["portrait"]: row for row in methods[MEAN_HEAD]}
     lines = []
-    for row in methods.get("b.3", []):
+    for row in methods.get(SHIPPED, []):
         if "scores" in row:
             scores, mean_head = row["scores"], heads[row["portrait"]]["scores"]
             lines.append(
@@ -232,6 +281,20 @@ def _tile(image: np.ndarray) -> np.ndarray:
     pixels = Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8))
     return np.asarray(pixels.resize((_TILE, _TILE), Image.LANCZOS)) / 255
 
+
+_ABLATIONS_TEXT = """## Ablations
+
+The methods of the paper's Figure 4 and two of this project, all at `{quality}` quality. a.1 and a.2 fit a field without
+deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves the
+deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was learned
+with the shapes, is the fit's geometry. b.1 to b.5 go on from a.4: b.1 with untrained decoders, b.2 without the
+refinement, b.3 as shipped, b.4 with a relief stage before the refinement (shape from shading, which moves the surface
+too), b.5 polished by path tracing.
+
+"""
+
+_COSTS_TEXT = """Wall-clock time of processes, their start and the writing of scored pictures included; a fit as shipped
+is a.4 and b.3 together."""
 
 _INTRODUCTION = """# Results of the single-image fit
 
