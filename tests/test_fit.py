@@ -52,6 +52,8 @@ def test_output_folder_is_complete_and_consistent(finished):
     report = json.loads((finished / "avatar.json").read_text())
     assert report["complete"] and report["psnr_inside_mask_db"] > 8
     assert set(report["losses"]) == {stage.name for _, stage in TINY.stages}
+    left_out = {(d["name"], d["where"]) for d in report["plan"] if d["left_out"]}
+    assert {("speculars", "light"), ("refinement", "light")} < left_out
     assert set(report["seconds"]) >= {"portrait", "latents", "refinement", "output", "total"}
     size = (128, 128)
     assert Image.open(finished / "input.png").size == size

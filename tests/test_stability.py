@@ -8,14 +8,15 @@ from conftest import small_avatar
 from scipy.special import erfcx
 
 import sira_mi.sg.integrals as integrals
+from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, surface
 from sira_mi.stability.fields64 import Field64
-from sira_mi.stability.page import page
+from sira_mi.stability.page import Measured, load_rows, page, write_page
 from sira_mi.stability.rows import Row, Section, largest, relative_error
 from sira_mi.stability.sections import SECTIONS
 
-MEASURES = [measure for section in SECTIONS for measure in section.measures]
+MEASURES = [measure for section in SECTIONS.values() for measure in section.measures]
 
 
 @pytest.mark.parametrize("measure", MEASURES, ids=[f"{m.__module__.split('.')[-1]}-{m.__name__}" for m in MEASURES])
@@ -38,7 +39,22 @@ def test_measures_notice_what_is_wrong():
     for fault in ({"error": 2.0}, {"error": np.nan}, {"non_finite": 1}, {"gradients_finite": False}):
         row = Row(**{**good, **fault})
         assert not row.passed
-        assert "**missed**" in page([(Section("t", "i", ()), [row])], quick=True)
+        assert "**missed**" in page({"a": Section("t", "i", ())}, {"a": Measured(True, (row,))})
+
+
+def test_a_section_that_is_not_measured_stays_on_the_page(tmp_path):
+    """Rows are read back as they were, infinite errors too; a damaged file is refused in one line."""
+    sections = {name: Section(f"Part {name}", "i", ()) for name in "ab"}
+    row = Row("r", "m", 1, float("inf"), 1.0, 0, True)
+    write_page(tmp_path, sections, {"a": Measured(False, (row,))})
+    measured = load_rows(tmp_path)
+    assert measured == {"a": Measured(False, (row,))}
+    path = write_page(tmp_path, sections, {**measured, "b": Measured(True, ())})
+    text = path.read_text(encoding="utf-8")
+    assert "## Part a" in text and "## Part b" in text and "Missed: r." in text
+    (tmp_path / "stability.json").write_text("[1]")
+    with pytest.raises(InputError, match="damaged"):
+        load_rows(tmp_path)
 
 
 def test_the_reference_field_is_the_package_s():

@@ -1,10 +1,12 @@
-"""Runs the stages of a fit: one Adam a stage, checkpoints on block boundaries, resume to the same result."""
+"""Runs the stages of a fit: one Adam a stage, in blocks of steps; checkpoints on block boundaries, resume to the same
+result. A block that diverges is taken back, and the steps from there on are shorter."""
 
 import json
 import math
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -13,6 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sira_mi.errors import InputError
+from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fit.settings import Stage
 from sira_mi.models.optimisation import (
     adam,
@@ -24,6 +27,15 @@ from sira_mi.models.optimisation import (
 )
 
 _CHECKPOINT_SECONDS = 10.0
+# A block has diverged when the median of its losses is above this multiple of the stage's lowest. Each step has rays of
+# its own, and weights of the losses may rise: healthy blocks come to 1.2 times the lowest.
+_DIVERGED = 2.0
+# How often the learning rates of a stage may be halved.
+_MOST_ROLLBACKS = 12
+
+
+class DivergedError(Exception):
+    """The fit runs away; the message says how."""
 
 
 class Problem(Protocol):
@@ -33,7 +45,8 @@ class Problem(Protocol):
         """Tensors that are set before the first step of a stage, by closed form rather than by descent."""
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
-        """Rebuilds whatever may lag behind the parameters; called every block and a function of `tensors` alone."""
+        """Rebuilds whatever may lag behind the parameters; called every block and a function of `tensors` alone. Raises
+        EmptySurfaceError when there is no head any more."""
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         """Weighted loss terms; `tensors` holds the stage's parameters as Dr.Jit arrays."""
@@ -41,21 +54,25 @@ class Problem(Protocol):
 
 @dataclass
 class Progress:
-    """Where a fit stands; what a checkpoint holds."""
+    """Where a fit stands: the start of the last block of a stage that went well. What a checkpoint holds."""
 
     tensors: dict[str, np.ndarray]  # avatar tensors so far
     stage: int = 0
     step: int = 0
-    optimizer: dict[str, np.ndarray] | None = None  # state of the stage's Adam, None at its start
-    seconds: dict[str, float] | None = None  # spent in each stage
-    losses: dict[str, dict[str, float]] | None = None  # last terms of each stage
+    optimizer: dict[str, np.ndarray] | None = None  # state of the stage's Adam, None before its start
+    lowest: float | None = None  # median loss of the stage's best block, None before its first
+    rollbacks: int = 0  # in this stage: each has halved its learning rates
+    seconds: dict[str, float] = field(default_factory=dict)  # spent in each stage
+    losses: dict[str, dict[str, float]] = field(default_factory=dict)  # last terms of each stage
+    notes: list[str] = field(default_factory=list)  # what the user should know, one line each
 
 
 def save_progress(path: Path, progress: Progress, identity: str) -> None:
     """Writes a checkpoint; `identity` names the photo, settings and seed that it belongs to."""
     arrays = {f"tensor/{k}": v for k, v in progress.tensors.items()}
     arrays |= {f"adam/{k}": v for k, v in (progress.optimizer or {}).items()}
-    description = {k: getattr(progress, k) for k in ("stage", "step", "seconds", "losses")}
+    described = ("stage", "step", "lowest", "rollbacks", "seconds", "losses", "notes")
+    description = {k: getattr(progress, k) for k in described}
     write_arrays(path, arrays, {"identity": identity, "progress": json.dumps(description)})
 
 
@@ -87,57 +104,117 @@ def run_stages(
     """Runs every stage from where `progress` stands. Each entry of `stages` is a function from the current tensors to
     the stage's problem, and the stage. On KeyboardInterrupt the parameters so far are kept and the exception goes on.
 
-    Raises InputError when a loss stops being finite."""
+    A block that diverges (`_run_block`) is taken back to the start of the last one that went well, with half the
+    learning rates for the rest of its stage, and a note says so. Raises InputError when that does not help."""
     total = sum(stage.steps for _, stage in stages)
-    done = sum(stage.steps for _, stage in stages[: progress.stage]) + progress.step
-    progress.seconds, progress.losses = progress.seconds or {}, progress.losses or {}
+    done = sum(stage.steps for _, stage in stages[: progress.stage])
     saved = time.monotonic()
-    with tqdm(total=total, initial=done, desc="fit", unit="step", mininterval=1.0, smoothing=0.05) as bar:
+    with tqdm(total=total, initial=done + progress.step, desc="fit", unit="step", mininterval=1, smoothing=0.05) as bar:
         while progress.stage < len(stages):
             make_problem, stage = stages[progress.stage]
             problem = make_problem(progress.tensors)
             if progress.optimizer is None:
                 progress.tensors |= problem.start(stage, progress.tensors)
             optimizer = adam({k: progress.tensors[k] for k in stage.rates}, stage.rates, beta_2=0.98)
-            if progress.optimizer:
-                restore_optimizer(optimizer, progress.optimizer)
+            if progress.optimizer is None:
+                progress.optimizer = optimizer_state(optimizer)
+            restore_optimizer(optimizer, progress.optimizer)
             started = time.monotonic()
+            step = progress.step
             try:
-                for step in range(progress.step, stage.steps):
-                    if step % block == 0:
-                        progress.tensors |= parameter_values(optimizer)
-                        progress.step, progress.optimizer = step, optimizer_state(optimizer)
-                        if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                            progress.seconds[stage.name] = (
-                                progress.seconds.get(stage.name, 0) + time.monotonic() - started
-                            )
-                            started = saved = time.monotonic()
-                            checkpoint(progress)
-                        problem.refresh(progress.tensors)
-                    rng = np.random.default_rng([seed, progress.stage, step])
-                    terms = _step(problem, optimizer, stage, step, rng)
-                    progress.losses[stage.name] = terms
-                    bar.update()
-                    bar.set_postfix_str(f"{stage.name} loss {sum(terms.values()):.4f}", refresh=False)
+                while step < stage.steps:
+                    steps = range(step, min(step + block, stage.steps))
+                    tensors, state = progress.tensors | parameter_values(optimizer), optimizer_state(optimizer)
+                    try:
+                        median = _run_block(problem, optimizer, stage, steps, tensors, progress, seed, bar)
+                    except (DivergedError, EmptySurfaceError) as error:
+                        _roll_back(stage, progress, error)
+                        restore_optimizer(optimizer, progress.optimizer)
+                        step = progress.step
+                        bar.n = done + step
+                        continue
+                    progress.tensors, progress.step, progress.optimizer = tensors, step, state
+                    progress.lowest = median if progress.lowest is None else min(median, progress.lowest)
+                    step = steps.stop
+                    if time.monotonic() - saved > _CHECKPOINT_SECONDS:
+                        progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+                        started = saved = time.monotonic()
+                        checkpoint(progress)
             finally:
                 progress.tensors |= parameter_values(optimizer)
                 progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+            done += stage.steps
             progress.stage, progress.step, progress.optimizer = progress.stage + 1, 0, None
+            progress.lowest, progress.rollbacks = None, 0
         bar.set_postfix_str("done")
     return progress
 
 
-def _step(problem: Problem, optimizer, stage: Stage, step: int, rng: np.random.Generator) -> dict[str, float]:
-    rates = {name: rate * _fall(step / stage.steps) for name, rate in stage.rates.items()}
+def _run_block(
+    problem: Problem,
+    optimizer,
+    stage: Stage,
+    steps: range,
+    tensors: dict[str, np.ndarray],
+    progress: Progress,
+    seed: int,
+    bar: tqdm,
+) -> float:
+    """Takes some steps from `tensors` on; returns the median of their losses.
+
+    Raises DivergedError when a loss or a parameter is not finite, or the median is far above the lowest of the stage
+    (in the first block, above the loss before the first step) and shorter steps may help; EmptySurfaceError when there
+    is no head before the block or after the stage's last."""
+    problem.refresh(tensors)
+    totals = []
+    for step in steps:
+        rng = np.random.default_rng([seed, progress.stage, step])
+        terms = _step(problem, optimizer, stage, step, 0.5**progress.rollbacks, rng)
+        totals.append(sum(terms.values()))
+        if not math.isfinite(totals[-1]):
+            raise DivergedError("the loss is not finite")
+        progress.losses[stage.name] = terms
+        bar.update()
+        bar.set_postfix_str(f"{stage.name} loss {totals[-1]:.4f}", refresh=False)
+    values = parameter_values(optimizer)
+    if not all(np.isfinite(value).all() for value in values.values()):
+        raise DivergedError("a parameter is not finite")
+    median = float(np.median(totals))
+    before = totals[0] if progress.lowest is None else progress.lowest
+    if median > _DIVERGED * before and progress.rollbacks < _MOST_ROLLBACKS:
+        raise DivergedError(f"the loss rose from {before:.3g} to {median:.3g}")
+    if steps.stop == stage.steps:
+        problem.refresh(tensors | values)
+    return median
+
+
+def _roll_back(stage: Stage, progress: Progress, error: Exception) -> None:
+    """Halves the learning rates of a stage that has diverged, and says so. Raises InputError after too many times."""
+    progress.rollbacks += 1
+    if progress.rollbacks > _MOST_ROLLBACKS:
+        raise InputError(
+            f"the fit diverges in stage {stage.name} at any learning rate ({error}); check the mask and the camera, or "
+            "try another --seed"
+        ) from error
+    note = (
+        f"the fit diverged in stage {stage.name} ({error}): taken back to step {progress.step}, learning rates times "
+        f"1/{2**progress.rollbacks}"
+    )
+    progress.notes.append(note)
+    tqdm.write(f"note: {note}", file=sys.stderr)
+
+
+def _step(
+    problem: Problem, optimizer, stage: Stage, step: int, factor: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """One step with `factor` times the stage's learning rates; the loss terms before it."""
+    rates = {name: factor * rate * _fall(step / stage.steps) for name, rate in stage.rates.items()}
     optimizer.set_learning_rate(rates)
     dr.enable_grad(*(optimizer[name] for name in optimizer))
     terms = problem.losses(dict(optimizer.items()), stage, step, rng)
     dr.backward(sum(terms.values()))
     optimizer.step()
-    values = {name: float(value.numpy().item()) for name, value in terms.items()}
-    if not all(math.isfinite(v) for v in values.values()):
-        raise InputError(f"the fit diverged in stage {stage.name}, step {step}: {values}; try another --seed")
-    return values
+    return {name: float(value.numpy().item()) for name, value in terms.items()}
 
 
 def _fall(share: float) -> float:

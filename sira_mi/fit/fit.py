@@ -9,12 +9,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-import skimage.data
 
 import sira_mi
 from sira_mi.errors import InputError
@@ -22,8 +22,19 @@ from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.rays import modelled_pixels
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, RELIEF, FitSettings, without
+from sira_mi.fit.settings import (
+    APPEARANCE,
+    GEOMETRY,
+    POLISH,
+    QUALITIES,
+    RELIEF,
+    FitSettings,
+    polish_stage,
+    without,
+)
 from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.plan.decisions import Plan, explain
+from sira_mi.plan.fit import plan_fit
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 from sira_mi.scene import orbited
@@ -50,6 +61,9 @@ class FitRequest:
     camera: Path | None = None
     face: int | None = None
     prior: Path | None = None
+    polish: bool = False  # path traced, after all other stages
+    explain: bool = False  # print what the stages leave out, with its measured error and time
+    keep_all: bool = False  # leave nothing out
     variant: str = "llvm_ad_rgb"
 
 
@@ -59,9 +73,14 @@ def fit_photo(request: FitRequest) -> int:
     Raises InputError for anything wrong with the photo, the options or the output folder."""
     started = time.monotonic()
     set_variant(request.variant)
+    from sira_mi.fit.polish import before_polish, polish_gain
+
     settings = QUALITIES[request.quality]
     if request.camera is not None:
         settings = without(settings, "pose")
+    if request.polish:
+        settings = replace(settings, stages=(*settings.stages, polish_stage()))
+    plan = plan_fit(settings).keeping() if request.keep_all else plan_fit(settings)
     prior_path = request.prior or PRIOR
     prior = load_avatar(prior_path)
     portrait = read_portrait(request, settings, prior)
@@ -88,9 +107,11 @@ def fit_photo(request: FitRequest) -> int:
             work,
             progress,
             lambda p: save_progress(checkpoint, p, identity),
+            plan,
         )
     except KeyboardInterrupt:
         interrupted = True
+        progress.tensors = before_polish(progress.tensors)
         print("interrupted: writing what there is; --resume goes on from the last checkpoint", file=sys.stderr)
 
     avatar = finished_avatar(prior, progress, settings)
@@ -101,10 +122,20 @@ def fit_photo(request: FitRequest) -> int:
         "seconds": {"portrait": round(seconds_portrait, 2), **{k: round(v, 2) for k, v in progress.seconds.items()}},
         "losses": progress.losses,
         "settings": asdict(settings),
-        "notes": list(portrait.notes),
+        "notes": [*portrait.notes, *progress.notes],
         "versions": {"sira_mi": sira_mi.__version__, **{p: version(p) for p in ("mitsuba", "drjit", "numpy")}},
     }
-    write_folder(request.out, with_pose(portrait, progress.tensors), avatar, settings, report, started)
+    if request.explain and not interrupted:
+        from sira_mi.plan.measure import measured_fit
+
+        problem = stage_problems(portrait, prior, prior_path, work, settings)[APPEARANCE](progress.tensors)
+        plan = measured_fit(plan, problem, settings, progress.tensors)
+        print(explain(plan), file=sys.stderr)
+    report["plan"] = plan.report()
+    posed = with_pose(portrait, progress.tensors)
+    if request.polish and not interrupted:
+        report["polish"] = polish_gain(posed, prior, progress.tensors, work / "geometry.safetensors", settings)
+    write_folder(request.out, posed, avatar, settings, report, started)
     if not interrupted:
         for file in work.iterdir():
             file.unlink()
@@ -120,10 +151,11 @@ def fit_portrait(
     work: Path,
     progress: Progress,
     checkpoint: Callable[[Progress], None] = lambda progress: None,
+    plan: Plan | None = None,
 ) -> None:
     """Runs the stages of `settings` from where `progress` stands, which follows; `work` is a folder for files in
-    between. Raises InputError when the fit diverges."""
-    problems = stage_problems(portrait, load_avatar(prior_path), prior_path, work, settings)
+    between, `plan` what is left out (default: that of `plan_fit`). Raises InputError when the fit diverges."""
+    problems = stage_problems(portrait, load_avatar(prior_path), prior_path, work, settings, plan)
     run_stages([(problems[kind], stage) for kind, stage in settings.stages], progress, settings.block, seed, checkpoint)
 
 
@@ -153,6 +185,8 @@ def read_portrait(request: FitRequest, settings: FitSettings, prior: Avatar) -> 
     with tempfile.TemporaryDirectory() as folder:
         photo = request.photo
         if request.example:
+            import skimage.data
+
             photo = Path(folder) / "astronaut.png"
             write_png(photo, skimage.data.astronaut() / 255)
         portrait = make_portrait(
@@ -203,11 +237,14 @@ def with_pose(portrait: Portrait, tensors: dict[str, np.ndarray]) -> Portrait:
     return replace(portrait, camera=moved_camera(portrait.camera, tensors["pose"]))
 
 
-def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settings: FitSettings) -> dict:
+def stage_problems(
+    portrait, prior: Avatar, prior_path: Path, work: Path, settings: FitSettings, plan: Plan | None = None
+) -> dict:
     """Per kind of stage a function from the current tensors to the stage's problem. A problem is made from the geometry
     at hand when the kind changes, and serves the stages of its kind that follow each other."""
     from sira_mi.fit.appearance import AppearanceProblem
     from sira_mi.fit.geometry import GeometryProblem
+    from sira_mi.fit.polish import PolishProblem
     from sira_mi.fit.relief import ReliefProblem
 
     made: dict[str, object] = {}
@@ -221,7 +258,7 @@ def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settin
 
         return problem
 
-    def on_fitted(problem: type) -> Callable[[dict], object]:
+    def on_fitted(problem: Callable) -> Callable[[dict], object]:
         def make(tensors):
             path = work / "geometry.safetensors"
             save_avatar(path, prior.replaced(**{k: v for k, v in tensors.items() if k in prior.tensors}))
@@ -231,8 +268,9 @@ def stage_problems(portrait, prior: Avatar, prior_path: Path, work: Path, settin
 
     return {
         GEOMETRY: of_kind(GEOMETRY, lambda tensors: GeometryProblem(portrait, prior, str(prior_path), settings)),
-        APPEARANCE: of_kind(APPEARANCE, on_fitted(AppearanceProblem)),
+        APPEARANCE: of_kind(APPEARANCE, on_fitted(partial(AppearanceProblem, plan=plan))),
         RELIEF: of_kind(RELIEF, on_fitted(ReliefProblem)),
+        POLISH: of_kind(POLISH, on_fitted(PolishProblem)),
     }
 
 
@@ -271,8 +309,9 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     close = output.box_camera(portrait.camera, box)
     turned = []
     for yaw in (-30, 30):
-        view = output.avatar_scene(str(avatar_path), orbited(close, yaw), output.SECOND_LIGHT, settings.voxel)
-        turned.append(linear_to_srgb(output.render_layers(view)["final"]))
+        camera = orbited(close, yaw)
+        view = output.avatar_scene(str(avatar_path), camera, output.SECOND_LIGHT, settings.voxel, extra_channels=False)
+        turned.append(linear_to_srgb(output.render_radiance(view)))
     write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))
 
     inside = portrait.mask * (layers["mask"] > 0.99)

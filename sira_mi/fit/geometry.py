@@ -11,9 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.errors import InputError
 from sira_mi.fields.columns import to_columns
-from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, rigid_motion, surface
 from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
@@ -98,17 +96,12 @@ class GeometryProblem:
         return {}
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
-        """Extracts the mesh that rays start from at the current parameters."""
+        """Extracts the mesh that rays start from at the current parameters. Raises EmptySurfaceError."""
         self.head.remesh_at_next_update()
         for name, key in _PARAMETERS.items():
             self.parameters[key] = mi.Float(tensors[name])
         self.parameters.set_dirty("head.z_sdf")
-        try:
-            self.parameters.update()
-        except EmptySurfaceError as error:
-            raise InputError(
-                "the fit lost its surface; check the mask and the camera, or try another --seed"
-            ) from error
+        self.parameters.update()
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
             field = self._field(self._fixed)

@@ -22,6 +22,7 @@ _MODELS = Path(__file__).parent / "models"
 _DETECTOR_SIDE, _LANDMARK_SIDE = 128, 192
 _DETECTOR_SCORE = 0.5
 _PRESENCE = 0.5
+_SURE = 0.95  # a face of less presence may be upside down; if it is, the turned crop shows a surer one
 _SEARCH_SIDE = 2048  # pixels; longest side of the image that the detector searches
 _EYE_CORNERS = (33, 263)  # outer corners, right and left eye of the subject
 _LANDMARK_MARGIN = 1.5  # side of the landmark crop over the size of the face
@@ -44,6 +45,11 @@ class Face:
         """The longer side of `box`, pixels: near the distance from forehead to chin, however the head is rolled."""
         left, top, right, bottom = self.box
         return float(max(right - left, bottom - top))
+
+    @property
+    def roll(self) -> float:
+        """Degrees by which the line between the eyes is turned clockwise, -180 to 180; 0 of an upright face."""
+        return _roll(self.landmarks[list(_EYE_CORNERS)])
 
 
 @lru_cache(maxsize=4)
@@ -189,9 +195,19 @@ def _same_face(face: Face, other: Face) -> bool:
 
 
 def _fit_landmarks(image: np.ndarray, keypoints: np.ndarray, box_size: float) -> Face:
-    """Landmarks from a detection (eyes and box centre `[3, 2]`, box side), cropped anew around each result."""
-    half = np.full(2, box_size / 2)
-    face = _refine(image, keypoints[2] - half, keypoints[2] + half, keypoints[:2], passes=1)
+    """Landmarks from a detection (eyes and box centre `[3, 2]`, box side). The detector takes a face that is upside
+    down for an upright one, so that a doubtful one is tried the other way up too."""
+    lower, upper = keypoints[2] - box_size / 2, keypoints[2] + box_size / 2
+    face = _settled(image, lower, upper, keypoints[:2])
+    if face.presence < _SURE:
+        turned = _settled(image, lower, upper, keypoints[1::-1])
+        face = turned if turned.presence >= _SURE else face
+    return face
+
+
+def _settled(image: np.ndarray, lower: np.ndarray, upper: np.ndarray, eyes: np.ndarray) -> Face:
+    """Landmarks cropped anew around each result, as far as there may be a face at all."""
+    face = _refine(image, lower, upper, eyes, passes=1)
     return landmarks_of(image, landmarks_of(image, face)) if face.presence >= _PRESENCE / 4 else face
 
 
@@ -200,11 +216,16 @@ def _refine(
 ) -> Face:
     """The mean over slightly different crops: single crops differ by about a hundredth of the face's height."""
     centre, side = (lower + upper) / 2, float((upper - lower).max())
-    across = eyes[1] - eyes[0]
-    roll = float(np.degrees(np.arctan2(across[1], across[0])))
+    roll = _roll(eyes)
     results = [_run_landmarks(image, centre, side * m, roll + turn) for m, turn in _MARGIN_TURN[:passes]]
     points = np.mean([r[0] for r in results], axis=0)
     return Face(points[:, :2], points[:, 2], float(np.mean([r[1] for r in results])))
+
+
+def _roll(eyes: np.ndarray) -> float:
+    """Degrees, clockwise, of the line from the subject's right eye to the left one, `[2, 2]` pixels."""
+    across = eyes[1] - eyes[0]
+    return float(np.degrees(np.arctan2(across[1], across[0])))
 
 
 def _run_landmarks(image: np.ndarray, centre: np.ndarray, side: float, roll: float) -> tuple[np.ndarray, float]:

@@ -16,6 +16,7 @@ from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, person_mask
 _MIN_FACE_SHARE = 0.2  # of the working size; below it the photo is cropped to the head first
 _WINDOW = 4.5  # side of that crop, in face sizes
 _FACE_POSITION = 0.42  # height of the face's centre in that crop, from its top
+_LARGEST_ROLL = 60.0  # degrees; the mask's network knows people who stand or sit
 _CAMERA_MISMATCH = 0.25  # in face sizes; a given camera that is further off earns a note
 
 
@@ -199,6 +200,9 @@ def _make_mask(
         notes.append("the photo's alpha channel is used as the mask")
     else:
         assert face is not None  # select_face raises otherwise
+        if abs(face.roll) > _LARGEST_ROLL:
+            how = "upside down" if abs(face.roll) > 135 else "on its side"
+            raise InputError(f"the face is {how}: turn the photo upright, or give --mask")
         mask = person_mask(display_image(image), face)
     if not (mask > 0.5).any():
         raise InputError("the mask is empty where the face is: give another with --mask, or select --face N")

@@ -1,5 +1,18 @@
-"""The page's sections in order: a new subject is a module with a `SECTION`, added here."""
+"""The page's sections in order, by the names of their modules: a new subject is a module with a `SECTION`, or a
+`section(work)` where something is kept on disk, added here."""
 
-from sira_mi.stability import sampling, spherical_gaussians, tracing
+from pathlib import Path
 
-SECTIONS = (spherical_gaussians.SECTION, sampling.SECTION, tracing.SECTION)
+from sira_mi.stability import fits, sampling, spherical_gaussians, tracing
+from sira_mi.stability.rows import Section
+
+SECTIONS = {
+    "spherical_gaussians": spherical_gaussians.SECTION,
+    "sampling": sampling.SECTION,
+    "tracing": tracing.SECTION,
+}
+
+
+def all_sections(work: Path) -> dict[str, Section]:
+    """Those and the fits, which are kept in the folder `work`."""
+    return {**SECTIONS, "fits": fits.section(work)}
