@@ -495,6 +495,30 @@ def test_differentiable_hit_moves_as_the_traced_hit_does(avatar, name):
     assert ad == pytest.approx(difference, rel=1e-3)
 
 
+def test_a_surface_through_grid_points_has_no_slivers():
+    """A sphere whose radius is a multiple of the spacing passes within rounding of many grid points; barycentric
+    coordinates of triangles with edges of 1e-6 voxels are not a number."""
+    voxel = 0.25
+    mesh = extraction.extract(lambda x: np.linalg.norm(x, axis=0) - np.float32(1.25), voxel)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    edges = np.concatenate([np.linalg.norm(d, axis=1) for d in (a - b, b - c, c - a)])
+    assert edges.min() > 5e-4 * voxel
+    watertight(mesh)
+
+
+def test_chunks_come_in_few_sizes_and_fill_columns_change_nothing(avatar):
+    """Kernels depend on sizes: pictures with other numbers of hits must find theirs compiled."""
+    field = head_field(avatar)
+    sizes = {sdf._padded_size(n) for n in range(1, sdf.CHUNK + 1)}
+    assert len(sizes) <= 33 and max(sizes) == sdf.CHUNK
+    assert all(n <= sdf._padded_size(n) <= max(2, 1.5 * n) for n in (1, 2, 3, 5, 700, 1025, 40_000))
+    x = np.random.default_rng(3).uniform(-1, 1, (3, 700)).astype(np.float32)
+    value = lambda p: sdf.signed_distance(field, p)  # noqa: E731
+    (found,), expected = sdf.evaluate_in_chunks(value, x), value(mi.TensorXf(x)).numpy()
+    assert found.shape == (1, 700)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def test_closest_approach_finds_the_smallest_distance_along_a_ray(avatar):
     field = head_field(avatar)
     evaluate = lambda x: sdf.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731

@@ -105,7 +105,7 @@ def compare_fits(arguments: argparse.Namespace) -> None:
             variant=arguments.variant,
         )
         found = compare(comparison)
-        write_rows(arguments.runs / f"{quality}.json", found)
+        write_rows(arguments.runs / quality / "rows.json", found)
         return found
 
     ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))

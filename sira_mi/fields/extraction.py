@@ -16,6 +16,9 @@ from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 # exact distance, the margin allows for |∇f| up to 1.6. Fields that are steeper as a whole are refined farther out.
 _MARGIN = 1.6
 _LEVELS = 3
+# |f| at a grid point counts as no less than this many spacings: where the surface runs through a point, its triangles
+# would shrink to slivers, on which barycentric coordinates are not a number.
+_LEAST_DISTANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,9 @@ def _refine(evaluate, values: np.ndarray, spacing: float, margin: float) -> tupl
 
 
 def _mesh(values: np.ndarray, spacing: float) -> ExtractedSurface:
-    padded = np.pad(values, 1, constant_values=np.float32(1e-3 * spacing))
+    least = np.float32(_LEAST_DISTANCE * spacing)
+    apart = np.copysign(np.maximum(np.abs(values), least), values)
+    padded = np.pad(apart, 1, constant_values=least)
     if not (padded.min() < 0 < padded.max()):
         raise EmptySurfaceError("the field has no surface inside the domain")
     from skimage.measure import marching_cubes

@@ -127,18 +127,24 @@ def normalised(v):
     return v / in_three(length)
 
 
+def _padded_size(count: int) -> int:
+    """The smallest of 2ᵏ and 3·2ᵏ⁻¹ that is not below `count`."""
+    power = 1 << max(count - 1, 1).bit_length()
+    return 3 * power // 4 if count <= 3 * power // 4 else power
+
+
 def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
     """Applies `function` (tensors [rows, n] -> tensor or tuple of tensors) to the columns of `arrays` [rows, N],
-    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Every chunk has the same size, so that
-    one kernel serves all."""
+    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks come in few sizes, filled up by
+    their last column: a size is part of the kernels, and compiling them takes longer than running them."""
     n = arrays[0].shape[1]
+    size = CHUNK if n > CHUNK else _padded_size(n)
     parts = []
     with dr.suspend_grad():
         for start in range(0, n, CHUNK):
             piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
             count = piece[0].shape[1]
-            if n > CHUNK and count < CHUNK:
-                piece = [np.pad(p, ((0, 0), (0, CHUNK - count)), mode="edge") for p in piece]
+            piece = [np.pad(p, ((0, 0), (0, size - count)), mode="edge") for p in piece]
             result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
             result = result if isinstance(result, tuple) else (result,)
             dr.eval(*result)
