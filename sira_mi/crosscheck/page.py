@@ -386,8 +386,8 @@ bounces, mesh of the plugin's usual spacing, the same lobes.
 
 {ratios}
 
-The last ratio is compilation: `sira_sg` has the number of hits in its kernels, so that pictures of new rays compile
-them anew. The curves and marks above are without that.
+The last ratio is compilation: some kernels of `sira_sg` know the number of hits. The curves and marks above are without
+that.
 
 The closed form without visibility (`shade`): nanoseconds for each lobe and point.
 
@@ -404,9 +404,8 @@ At the upper end the time a pixel grows with the width to the power of {by_width
 _NO_FITS = """Error in mm and dB against the time of a fit over the quality presets comes from the rows of a benchmark,
 which this run was not given. With them:
 
-    python -m sira_mi.evaluate fits --benchmark BENCHMARK --runs DRAFT --quality draft
-    python -m sira_mi.evaluate fits --benchmark BENCHMARK --runs STANDARD --quality standard
-    python -m sira_mi.crosscheck --fits DRAFT/rows.json STANDARD/rows.json"""
+    python -m sira_mi.evaluate fits --benchmark BENCHMARK --runs RUNS
+    python -m sira_mi.crosscheck --fits RUNS/draft/rows.json RUNS/standard/rows.json"""
 
 _FITS_TEXT = """The shipped fit over the benchmark's portraits, a point for each set of fits: median wall time of a fit
 with all of its stages, mean distance between the true face and the fitted one, and PSNR of the re-render."""
