@@ -347,7 +347,7 @@ def zero_gradient(quick: bool) -> Row:
 
 def bounded_evaluations(quick: bool) -> Row:
     """The longest way that a ray can go: Newton steps, the whole search, Newton steps again."""
-    count = 1000
+    count = 1024  # a size that chunks are not filled up to
     rng = np.random.default_rng(39)
     columns = [np.float32(rng.standard_normal((3, count))), np.float32(cases.directions(rng, count))]
     calls, bad = 0, 0
