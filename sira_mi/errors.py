@@ -1,11 +1,19 @@
 """The one exception for input that a user can mend; commands print it as one line and exit with code 2."""
 
+import argparse
 import sys
 from collections.abc import Callable
 
 
 class InputError(Exception):
     """Bad input: the message is one clear line that says what was wrong and what to do."""
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser of command lines whose errors are `InputError`s."""
+
+    def error(self, message):
+        raise InputError(f"{message}; --help lists the options")
 
 
 def run_command(main: Callable[[], int | None]) -> None:

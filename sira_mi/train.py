@@ -6,13 +6,12 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +34,7 @@ APPEARANCE_TERMS = ("embedding", "smoothness", "specular_anchor", "white_light",
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m sira_mi.train", description=__doc__.split("\n")[0])
+    parser = CommandParser(prog="python -m sira_mi.train", description=__doc__.split("\n")[0])
     parser.add_argument("model", choices=("shape", "appearance"))
     parser.add_argument("--collection", type=Path, required=True, help="folder of python -m sira_mi.collection build")
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, logs, pictures and the prior")

@@ -3,14 +3,14 @@
 import argparse
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 # Seed of the first head of the landmark check; no collection's heads have it.
 FIRST_CHECKED = 800_000
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="sira_mi.collection", description="Training scenes of synthetic heads.")
+    parser = CommandParser(prog="sira_mi.collection", description="Training scenes of synthetic heads.")
     commands = parser.add_subparsers(dest="command", required=True)
     make = commands.add_parser("build", help="build or resume a collection")
     make.add_argument("--out", type=Path, required=True, help="folder for the scenes")

@@ -6,7 +6,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 _DESCRIPTION = """\
 Renders one head under several lights by closed forms and by path tracing, splits their difference into its causes,
@@ -16,13 +16,8 @@ AVATAR is the output folder of a fit or an avatar.safetensors, SCENE an .xml wit
 sg_envmap, whose own light is measured too; without either it is the mean head of the shipped prior."""
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        raise InputError(f"{message}; --help lists the options")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = CommandParser(
         prog="python -m sira_mi.crosscheck",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,

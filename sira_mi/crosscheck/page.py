@@ -155,7 +155,7 @@ def _marks(measured: Measured) -> str:
                     f"{ratio.name} over {ratio.over}",
                     f"≤ {ratio.mark:g}×",
                     f"{ratio.value:.3g}×",
-                    _verdict(ratio.met, f"by a factor of {ratio.value / ratio.mark:.2g}"),
+                    _verdict(ratio.met, f"by a factor of {ratio.value / ratio.mark:.3g}"),
                 ]
             )
     for slope in curves.slopes([point for one in measured.lit for point in one.points]):

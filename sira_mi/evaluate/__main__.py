@@ -10,11 +10,11 @@ import argparse
 import time
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m sira_mi.evaluate", description=__doc__.split("\n")[0])
+    parser = CommandParser(prog="python -m sira_mi.evaluate", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     prior = commands.add_parser("prior", help="measure the prior and the ablations, write the page")
     sizes = commands.add_parser("sizes", help="train and measure networks of several sizes, write the page")

@@ -82,7 +82,7 @@ class FitSettings:
 
 def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]:
     """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales. Geometry that is fitted for
-    longer follows the photo further from the prior, and not nearer to the person."""
+    longer follows the photo further from the prior, on some heads away from the person."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)

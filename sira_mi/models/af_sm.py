@@ -1,6 +1,7 @@
 """AF-SM, the appearance factorization model: self-supervised auto-decoder training, eq. 10 (section 3.1.4).
 
-It sees the images only, never the true albedo. Points enter through the frozen deformation of a trained SA-SM."""
+It sees the images and which region a point is of, never the true albedo. Points enter through the frozen deformation of
+a trained SA-SM."""
 
 from __future__ import annotations
 
@@ -41,15 +42,9 @@ class AppearanceTraining:
     jitter: float = 0.015  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
     smoothness: float = 0.01  # λ7 (NeRFactor 0.05)
-    specular_anchor: float = 0.01  # pull of the log specular albedo to the level of its region, which images hardly
-    # determine
-    specular_levels: tuple[float, ...] = (
-        SKIN_SPECULAR,
-        0.024,
-        0.07,
-        0.008,
-    )  # of skin, hair, eye and cloth: reflectance
-    # at normal incidence, skin's by FLARE, the others those of the collection
+    specular_anchor: float = 0.01  # pull of the log specular albedo to its region's level, which images hardly tell
+    # Reflectance at normal incidence of skin (FLARE), hair, eyes and cloth (those of the collection).
+    specular_levels: tuple[float, ...] = (SKIN_SPECULAR, 0.024, 0.07, 0.008)
     white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
     skin_tone: float = 1e-3  # on the deviations of a face's skin albedo from measured skin, which settles the
     # level and colour of the light against the albedo's

@@ -1,13 +1,12 @@
 """`python -m sira_mi.plan AVATAR [--lights FILE] [--out docs]`: measures what a head's pictures and a fit leave out."""
 
-import argparse
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m sira_mi.plan", description=__doc__.split(": ")[1])
+    parser = CommandParser(prog="python -m sira_mi.plan", description=__doc__.split(": ")[1])
     parser.add_argument("avatar", type=Path, metavar="AVATAR", help="output folder of a fit, or an avatar.safetensors")
     parser.add_argument("--lights", type=Path, help=".exr environment or .json lobes (default: the light of the photo)")
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of plan.md (default: docs)")

@@ -6,7 +6,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 _DESCRIPTION = """\
 Renders a fitted head under another light, and writes IMAGE.exr (linear radiance) and IMAGE.png (sRGB).
@@ -28,13 +28,8 @@ _ENDINGS = (".exr", ".png")
 _OTHER_ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".hdr", ".mp4")
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        raise InputError(f"{message}; --help lists the options")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = CommandParser(
         prog="python -m sira_mi.relight",
         description=_DESCRIPTION,
         epilog=_EPILOG,

@@ -4,15 +4,14 @@ The fits take half an hour; those that are finished are kept in `--work` and don
 depend on has changed. Sections that are not measured stay on the page as they were. Ends with 1 when a row misses its
 bound."""
 
-import argparse
 import time
 from pathlib import Path
 
-from sira_mi.errors import InputError, run_command
+from sira_mi.errors import CommandParser, InputError, run_command
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m sira_mi.stability", description=__doc__.split("\n")[0])
+    parser = CommandParser(prog="python -m sira_mi.stability", description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
     parser.add_argument("--work", type=Path, default=Path("build/stability"), help="folder of portraits and fits")
     parser.add_argument("--only", nargs="+", metavar="SECTION", help="measure only these sections: fits, tracing, ...")
