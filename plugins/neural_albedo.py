@@ -67,12 +67,13 @@ class NeuralAlbedo(mi.Texture):
     `params.update()` after gradients are enabled. The three-channel texture gives its luminance where one channel is
     asked for; the one-channel texture gives grey where three are.
 
-    Networks make most of the cost of path tracing a head. A `baked` texture is looked up instead: the shape keeps its
-    albedo as the mesh attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (a number is appended where several
-    baked textures of one kind share a head) and renews it whenever parameters are changed through the scene or the
-    shape. It is as sharp as the mesh is fine: give the shape a `voxel` of 0.03 or less. It is detached: no gradient
-    reaches this texture's parameters, and enabling one raises RuntimeError at the next render. Outside of a
-    `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case.
+    Networks make most of the cost of path tracing a head; and Mitsuba compiles those of every texture that is alive in
+    the process into the kernels of every picture, also of other scenes. A `baked` texture is looked up instead: the
+    shape keeps its albedo as the mesh attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (a number is
+    appended where several baked textures of one kind share a head) and renews it whenever parameters are changed
+    through the scene or the shape. It is as sharp as the mesh is fine: give the shape a `voxel` of 0.03 or less. It is
+    detached: no gradient reaches this texture's parameters, and enabling one raises RuntimeError at the next render.
+    Outside of a `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case.
 
     Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
 

@@ -4,14 +4,14 @@ import numpy as np
 
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
-from sira_mi.fields.sdf import evaluate_in_chunks, normalised, surface
+from sira_mi.fields.sdf import deform, evaluate_in_chunks, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
-from sira_mi.sg import visibility
+from sira_mi.sg import multisampling, visibility
 
 # Rows of the columns that are computed at a hit, in order.
 _ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}
@@ -39,10 +39,17 @@ class SiraSG(mi.SamplingIntegrator):
      * - aovs
        - |bool|
        - Give the extra channels. (Default: true)
+     * - exact
+       - |bool|
+       - Hits and normals of the field. Without it those of the mesh, and albedos from its vertices where a texture is
+         baked: quicker, and as good as the shape's `voxel` is fine. (Default: true)
+     * - shared
+       - |bool|
+       - Samples of one pixel that all see the head within 4 mm, with normals within 15 degrees, are shaded once, at
+         the one in their middle; what the head covers is still found by the sample. (Default: false)
      * - shaded_lobes
        - |tensor|
-       - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. Where something is
-         differentiated, all are summed up. (Default: all)
+       - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. (Default: all)
 
     Eq. 8 in closed form: the radiance that a `neural_sdf` with a `sira_bsdf` reflects under an `sg_envmap`, without
     sampling and without noise. Shadows come from rays against the scene's meshes in a fixed set of directions, half of
@@ -57,11 +64,12 @@ class SiraSG(mi.SamplingIntegrator):
     `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene
     units) and `mask` (1 on the head). All are zero off the head.
 
-    Hits are exact. Differentiable in everything that the scene exposes: lobes, albedo networks and latents, k_s and
-    k_r, and, through implicit differentiation, the shape's latent and networks (interior derivatives; for silhouettes
-    see `sira_radiance` and the stock projective integrators). What blocks the light, and the directions in which that
-    is tested, count as constants. Cannot be nested in symbolic code. Derivatives repeat bit for bit, but for those of
-    lobes through a background that is shown, which the emitter sums by atomics.
+    Where something is differentiated, hits are exact, every sample has its own shading and all lobes are summed up,
+    whatever the options say. Differentiable in everything that the scene exposes: lobes, albedo networks and latents,
+    k_s and k_r, and, through implicit differentiation, the shape's latent and networks (interior derivatives; for
+    silhouettes see `sira_radiance` and the stock projective integrators). What blocks the light, and the directions in
+    which that is tested, count as constants. Cannot be nested in symbolic code. Derivatives repeat bit for bit, but for
+    those of lobes through a background that is shown, which the emitter sums by atomics.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.3; PhySG (Zhang et al. 2021).
 
@@ -79,6 +87,8 @@ class SiraSG(mi.SamplingIntegrator):
         if not 16 <= self.directions <= 4096:
             raise InputError(f"sira_sg: visibility_directions is {self.directions}; it must be 16 to 4096")
         self.aovs = bool(props.get("aovs", True))
+        self.exact = bool(props.get("exact", True))
+        self.shared = bool(props.get("shared", False))
         self.shaded_lobes = np.array(props["shaded_lobes"]).astype(int) if "shaded_lobes" in props else None
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -90,7 +100,20 @@ class SiraSG(mi.SamplingIntegrator):
             raise RuntimeError("sira_sg: the environment must be an sg_envmap; use path for other lights")
         ray = mi.Ray3f(ray)
         width = dr.width(ray.o, ray.d)
-        t, hit = trace_head(scene, head, ray, active)
+        attached = dr.grad_enabled(*differentiable_arrays(head, bsdf, light), ray.o, ray.d)
+        samples = sampler.sample_count() if self.shared and sampler is not None and not attached else 1
+        shared = samples > 1 and width % samples == 0
+        surface_hits = leader = None
+        if attached or (self.exact and not shared):
+            t, hit = trace_head(scene, head, ray, active)
+        else:
+            surface_hits, hit = mesh_hits(scene, head, ray, active)
+            t, shaded = surface_hits.t, hit
+            if shared:
+                arrays = (surface_hits.p, surface_hits.sh_frame.n, hit)
+                leader = mi.UInt32(multisampling.leaders(*(a.numpy() for a in arrays), samples))
+                shaded = hit & (leader == dr.arange(mi.UInt32, width))
+            t, hit = head.refine(ray, t, shaded) if self.exact else (t, shaded)
 
         background = dr.zeros(mi.Color3f, width)
         if not self.hide_environment:
@@ -102,11 +125,15 @@ class SiraSG(mi.SamplingIntegrator):
         kinds = {name: mi.Color3f if rows == 3 else mi.Float for name, rows in rows_of.items()}
         parts = {name: dr.zeros(kind, width) for name, kind in kinds.items()}
         if dr.width(index) > 0:
-            columns = self._shade(scene, head, bsdf, light, ray, t, index)
+            on_mesh = None if attached or self.exact else dr.gather(mi.SurfaceInteraction3f, surface_hits, index)
+            columns = self._shade(scene, head, bsdf, light, ray, t, index, attached, on_mesh)
             row = 0
             for name, rows in rows_of.items():
                 parts[name] = scatter_columns(columns[row : row + rows, :], index, width, kinds[name])
                 row += rows
+        if leader is not None:
+            t, hit = dr.gather(mi.Float, t, leader), dr.gather(mi.Bool, hit, leader)
+            parts = {name: dr.gather(kinds[name], part, leader) for name, part in parts.items()}
         color = dr.select(hit, parts["diffuse"] + parts["specular"], background)
         valid = active & (hit | (not self.hide_environment))
         if not self.aovs:
@@ -123,13 +150,13 @@ class SiraSG(mi.SamplingIntegrator):
         ]
         return color, valid, aovs
 
-    def _shade(self, scene, head, bsdf, light, ray, t, index):
+    def _shade(self, scene, head, bsdf, light, ray, t, index, attached, on_mesh):
         """All of `_ROWS` at the hits `index`, as one tensor [13, n], or the radiances [6, n] without extra channels; in
-        chunks when nothing is differentiated."""
+        chunks when nothing is differentiated. `on_mesh` are the interactions with the mesh, None where hits are
+        exact."""
         field = head.field()
         local = head.to_local @ ray
         origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
-        attached = dr.grad_enabled(*differentiable_arrays(head, bsdf, light), origin, direction)
         lobes = all_lobes = local_lobes(light, head)
         if not attached:
             lobes = self._shaded(lobes)
@@ -162,13 +189,20 @@ class SiraSG(mi.SamplingIntegrator):
 
         def columns(x, direction):
             _, gradient, x_ref, gamma = surface(field, x)
-            normal = normalised(gradient)
             diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
             specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1) if speculars or self.aovs else None
+            return shaded(x, direction, normalised(gradient), diffuse, specular)
+
+        def shaded(x, direction, normal, diffuse, specular):
             radiance = radiances(x, normal, normalised(direction), diffuse, specular)
             extra = (diffuse, specular, rotation @ normal) if self.aovs else ()
             return dr.concat([*radiance, *extra], axis=0)
 
+        if on_mesh is not None:
+            inverse = mi.TensorXf(np.ascontiguousarray(rotation_of(head.to_world).T))
+            x, normal = to_columns(head.to_local @ on_mesh.p), inverse @ to_columns(on_mesh.sh_frame.n)
+            at_mesh = (x, direction, normal, *mesh_albedos(head, bsdf, on_mesh, x))
+            return mi.TensorXf(evaluate_in_chunks(shaded, *(a.numpy() for a in at_mesh))[0])
         if not attached:
             x = on_ray(origin, direction, parameter)
             return mi.TensorXf(evaluate_in_chunks(columns, x.numpy(), direction.numpy())[0])
@@ -194,6 +228,33 @@ class SiraSG(mi.SamplingIntegrator):
 
     def to_string(self):
         return f"SiraSG[hide_emitters = {self.hide_environment}, visibility = {self.visibility}]"
+
+
+def mesh_hits(scene, head, ray, active):
+    """Interactions of `ray` with the scene's meshes, and whether they are with the head's."""
+    with dr.suspend_grad():
+        si = scene.ray_intersect(ray, active)
+        hit = active & si.is_valid() & (si.shape == mi.ShapePtr(head))
+        dr.eval(si, hit)
+        return si, hit
+
+
+def mesh_albedos(head, bsdf, si, x) -> list:
+    """Diffuse [3, N] and specular albedo [1, N] at interactions `si` with the head's mesh, whose places are x [3, N] in
+    the field's coordinates: baked ones and those of other textures as they are asked for at `si`, else by networks."""
+    textures = (bsdf.diffuse_albedo, bsdf.specular_albedo)
+    by_network = [isinstance(texture, NeuralAlbedo) and not texture.baked for texture in textures]
+    inputs = evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy()) if any(by_network) else None
+    result = []
+    with dr.suspend_grad():
+        for texture, neural, rows in zip(textures, by_network, (3, 1), strict=True):
+            if neural:
+                values = evaluate_in_chunks(lambda *a, t=texture, n=rows: t.evaluate_columns(*a)[0:n, :], *inputs)[0]
+                result.append(mi.TensorXf(values))
+            else:
+                value = texture.eval_3(si) if rows == 3 else texture.eval_1(si)
+                result.append(to_columns(value + dr.zeros(mi.Float, x.shape[1])))
+    return result
 
 
 def open_directions(scene, head, x, normal, directions):

@@ -123,7 +123,7 @@ def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
         {
             "type": "scene",
             "integrator": {"type": "sira_sg" if integrator == "sg" else "path", "hide_emitters": True},
-            "sensor": sensor(VIEW),
+            "sensor": sensor(VIEW, {"type": "multijitter" if integrator == "sg" else "independent"}),
             "head": description,
             "light": light.turned(np.eye(3)),
         }

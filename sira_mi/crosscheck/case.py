@@ -51,11 +51,13 @@ class Case:
             bsdf[texture]["baked"] = baked
         return mi.load_dict(description)
 
-    def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None) -> mi.Scene:
-        """The head under `lobes` [N_l, 7], or under an emitter's description instead."""
+    def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:
+        """The head under `lobes` [N_l, 7], or under an emitter's description instead; seen through independent samples,
+        or through `even` ones, spread over each pixel."""
         light = light or {"type": "sg_envmap", "lobes": mi.TensorXf(np.ascontiguousarray(lobes, np.float32))}
         others = {f"other_{k}": shape for k, shape in enumerate(self.others)}
-        return mi.load_dict({"type": "scene", "sensor": self.sensor, "head": head, "light": light, **others})
+        sensor = {**self.sensor, "sampler": {"type": "stratified" if even else "independent"}}
+        return mi.load_dict({"type": "scene", "sensor": sensor, "head": head, "light": light, **others})
 
 
 def load_case(path: Path | None, size: int) -> Case:
@@ -124,7 +126,6 @@ def _sensor(path: Path, sensor: mi.Sensor, size: int) -> tuple[dict, int, int]:
         **offset,
         "to_world": mi.ScalarTransform4f(np.array(params["to_world"].matrix.numpy(), np.float64).reshape(4, 4)),
         "film": scenes.film(width, height),
-        "sampler": {"type": "independent"},
     }
     return description, width, height
 

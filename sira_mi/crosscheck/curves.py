@@ -22,14 +22,16 @@ from sira_mi.crosscheck.images import (
     resolution,
     root,
 )
-from sira_mi.crosscheck.points import field_points, mesh_points
+from sira_mi.crosscheck.points import field_points
 
 PHYSG, FORM, VISIBLE = "a: PhySG", "b: closed form", "c: with visibility (sira_sg)"
-VISIBLE_MESH = "c': with visibility, on the mesh, baked"
+SHARED = "c: with visibility, shared by samples"
+SHARED_MESH = "c: with visibility, shared, on the mesh, baked"
 DIRECT, BOUNCE, PATH = "d: direct light, Monte Carlo", "e: path, one bounce", "e: path, all bounces"
 # Depths of Mitsuba's path tracer.
 DEPTHS = {DIRECT: 2, BOUNCE: 3, PATH: -1}
-_SIDES = (1, 2, 3)
+# Samples a pixel of closed forms, the square roots: of those that shade every sample, and of those that share shadings.
+_SIDES, _SHARED_SIDES = (1, 2, 3), (2, 3, 4, 6)
 _TRACED_SAMPLES = (1, 4, 16, 64, 256, 1024, 4096)
 _REPEATS = 3
 # Of closed forms, which take turns with two sets of rays.
@@ -84,29 +86,26 @@ def timed(function: Callable[[int], np.ndarray], repeats: int, warm: bool) -> tu
     return result, float(np.median(spent))
 
 
-def _closed_forms(
-    case: Case, scene: mi.Scene, head: mi.Shape, lobes: np.ndarray, seed: int, log: LaunchLog
-) -> Iterator:
+def _closed_forms(case: Case, head: mi.Shape, lobes: np.ndarray, seed: int, log: LaunchLog) -> Iterator:
     """(method, samples, function of the run's number that renders it)."""
+    scene = case.scene(head, lobes, even=True)
     light = (forms.local_lobes(lobes, head), case.roughness, case.k_s)
 
     def physg(side, k):
         points = field_points(case, scene, head, side, seed + k)
         return points.picture(forms.physg(points, *light))
 
-    def on_mesh(side, k):
-        points = mesh_points(case, scene, head, side, seed + k, networks=False)
-        return points.picture(forms.with_visibility(points, scene, head, *light))
-
-    plugins = {
-        name: mi.load_dict({"type": "sira_sg", "hide_emitters": True, "visibility": visibility})
-        for name, visibility in ((FORM, False), (VISIBLE, True))
-    }
     for side in _SIDES:
         yield PHYSG, side**2, lambda k, side=side: physg(side, k)
-        for name, plugin in plugins.items():
+    for name, sides, options in (
+        (FORM, _SIDES, {"visibility": False}),
+        (VISIBLE, _SIDES, {}),
+        (SHARED, _SHARED_SIDES, {"shared": True}),
+        (SHARED_MESH, _SHARED_SIDES, {"shared": True, "exact": False}),
+    ):
+        plugin = mi.load_dict({"type": "sira_sg", "hide_emitters": True, "aovs": False, **options})
+        for side in sides:
             yield name, side**2, lambda k, side=side, plugin=plugin: render(scene, plugin, side**2, seed, 2, k, log=log)
-        yield VISIBLE_MESH, side**2, lambda k, side=side: on_mesh(side, k)
 
 
 def measure_curves(
@@ -128,7 +127,7 @@ def measure_curves(
         error = relative_error(image, reference, mask)
         points.append(Point(light, method, samples, spent, error, flip(image, reference.mean, mask)))
 
-    for method, samples, function in _closed_forms(case, scene, head, lobes, seed, log):
+    for method, samples, function in _closed_forms(case, head, lobes, seed, log):
         add(method, samples, *timed(function, _TURNS, warm=True))
     left = max(seconds - (time.monotonic() - start), 0.4 * seconds)
     for method, depth in DEPTHS.items():

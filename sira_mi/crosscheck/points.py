@@ -87,9 +87,8 @@ def field_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: i
     )  # fmt: skip
 
 
-def mesh_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: int, networks: bool = True) -> Points:
-    """The hits on the mesh with its interpolated normals, as Mitsuba's integrators find them. Without `networks`, the
-    albedos are the baked ones."""
+def mesh_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: int) -> Points:
+    """The hits on the mesh with its interpolated normals, as Mitsuba's integrators find them."""
     ray = primary_rays(case, scene, side, seed)
     si = scene.ray_intersect(ray)
     baked = head.bsdf()
@@ -110,7 +109,7 @@ def mesh_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: in
         return tuple(texture.evaluate_columns(x_ref, gamma) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo))
 
     looked_up = at(diffuse), at(specular)
-    albedos = evaluate_in_chunks(columns, x) if networks else looked_up
+    albedos = evaluate_in_chunks(columns, x)
     normal, facing, view = (inverse @ at(v) for v in (si.sh_frame.n, si.n, -ray.d))
     lift = float(mi.math.RayEpsilon) * (1 + float(np.abs(x).max()))
     return Points(

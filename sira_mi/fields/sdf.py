@@ -138,13 +138,12 @@ def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
     `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks come in few sizes, filled up by
     their last column: a size is part of the kernels, and compiling them takes longer than running them."""
     n = arrays[0].shape[1]
-    size = CHUNK if n > CHUNK else _padded_size(n)
     parts = []
     with dr.suspend_grad():
         for start in range(0, n, CHUNK):
             piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
             count = piece[0].shape[1]
-            piece = [np.pad(p, ((0, 0), (0, size - count)), mode="edge") for p in piece]
+            piece = [np.pad(p, ((0, 0), (0, _padded_size(count) - count)), mode="edge") for p in piece]
             result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
             result = result if isinstance(result, tuple) else (result,)
             dr.eval(*result)

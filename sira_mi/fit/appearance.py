@@ -30,7 +30,7 @@ class AppearanceProblem:
         self.plan = plan_fit(settings) if plan is None else plan
         self._base_at, self._base = None, None
         head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": settings.voxel})
-        self.points = photo_points(portrait, head)
+        self.points = photo_points(portrait, head, settings.shadows)
         self.skin = skin_patches(portrait, self.points)
         self.target = np.ascontiguousarray(portrait.image[self.points.row, self.points.column].T, dtype=np.float32)
 

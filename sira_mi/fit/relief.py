@@ -29,14 +29,14 @@ class ReliefProblem:
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Keeps the surface as it is before the stage, as points [3, N] that the stage may not leave far behind."""
-        points = photo_points(self.portrait, self.head)
+        points = photo_points(self.portrait, self.head, self.settings.shadows)
         return {"relief_anchor": (points.origin + points.t * points.view).astype(np.float32)}
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Finds the photo's points on the current surface, and what light reaches them."""
         self.parameters["head.deformation"] = mi.Float(tensors["deformation"])
         self.parameters.update()
-        self.points = photo_points(self.portrait, self.head)
+        self.points = photo_points(self.portrait, self.head, self.settings.shadows)
         self.anchor = tensors["relief_anchor"]
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
 

@@ -77,6 +77,7 @@ class FitSettings:
     appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
     relief: ReliefWeights = field(default_factory=ReliefWeights)
     polish: PolishSettings = field(default_factory=PolishSettings)
+    shadows: bool = True  # of the head on itself, and light that it reflects onto itself, in the appearance stages
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 

@@ -70,10 +70,12 @@ def seen_points(camera: Camera, head) -> SeenPoints:
     return SeenPoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
 
 
-def photo_points(portrait: Portrait, head) -> PhotoPoints:
-    """The points of a `neural_sdf` that the portrait shows inside its mask."""
+def photo_points(portrait: Portrait, head, shadows: bool = True) -> PhotoPoints:
+    """The points of a `neural_sdf` that the portrait shows inside its mask; without `shadows`, open to all sides."""
     seen = seen_points(portrait.camera, head)
     seen = seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
+    if not shadows:
+        return PhotoPoints(**vars(seen), is_open=np.ones((DIRECTIONS, len(seen.row)), bool))
     scene = mi.load_dict({"type": "scene", "head": head})
     place = seen.origin + seen.t * seen.view
     is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel)

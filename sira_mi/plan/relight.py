@@ -13,11 +13,13 @@ from sira_mi.plan.surface import (
     sample_surface,
     seen_from,
     shadow_error,
+    sharing_error,
 )
 from sira_mi.relight.render import RelightSettings, head_window
 from sira_mi.relight.subject import Light, Subject
 from sira_mi.scene import orbited
 from sira_mi.sg.fit_environment import pixel_directions, sphere_integral
+from sira_mi.sg.multisampling import REACH
 from sira_mi.sg.shading import shade_tensor
 from sira_mi.sg.weak_lobes import needed_lobes, radiance_bounds, white_radiance
 
@@ -47,8 +49,8 @@ def plan_relight(
     exact: bool = False,
 ) -> Plan:
     """The decisions about pictures of `shape` (of `load_head`) at some `yaws`, degrees, with errors up to `tolerance`
-    each. `settings` are those that leave nothing out, which `Plan.apply` changes. Baked albedos, the default of path
-    tracing, are a decision whatever their error, unless `exact` ones are asked for."""
+    each. `settings` are those that leave nothing out, which `Plan.apply` changes. Baked albedos in path tracing and
+    shared shadings in closed form are left out whatever their error, unless `exact` pictures are asked for."""
     avatar, path = subject.avatar, settings.integrator == "path"
     points = sample_surface(shape)
     lobes = image_lobes(light.image) if light.lobes is None else light.lobes
@@ -71,6 +73,7 @@ def plan_relight(
     else:
         decisions += [
             _visibility(shape, points, subject, lobes, white, limit, views),
+            _shadings(shape, subject, lobes, white, settings, views, exact),
             Decision(
                 "extra channels", _PICTURE, True, "only the radiance is written", changes={"extra_channels": False}
             ),
@@ -173,6 +176,25 @@ def _visibility(shape, points, subject, lobes, white, limit, views):
     reason = f"the head's own shadows change seen points by {worst / white:.1e} of white"
     changes = {"visibility": False}
     return Decision("visibility", _PICTURE, worst <= limit, reason, worst / white, changes=changes)
+
+
+def _shadings(shape, subject, lobes, white, settings, views, exact):
+    name = "a shading for every sample"
+    if exact:
+        return Decision(name, _PICTURE, False, "asked for by --exact")
+    if settings.samples == 1:
+        return Decision(name, _PICTURE, False, "there is one sample a pixel")
+    avatar, worst = subject.avatar, 0.0
+    for yaw in views:
+        camera = orbited(subject.camera, yaw)
+        footprint = np.linalg.norm(camera.centre - shape.vertices().mean(axis=1)) / camera.K[0, 0]
+        reach = min(REACH, 2 * footprint)
+        error = sharing_error(
+            shape, camera.centre, _lobes_at(lobes, yaw), avatar.roughness, avatar.k_s, _DIRECTIONS, reach
+        )
+        worst = max(worst, error)
+    reason = f"radiance within a pixel differs by up to {worst / white:.1e} of white; --exact shades every sample"
+    return Decision(name, _PICTURE, True, reason, worst / white, changes={"shared": True})
 
 
 def _outside(subject, shape, settings, yaws):

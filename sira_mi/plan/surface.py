@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from sira_mi.fields.columns import from_columns
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, surface
 from sira_mi.models.af_sm import physical_radiance
+from sira_mi.sg.multisampling import COSINE
 from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, even_directions, light_directions, trace_open
 
 _POINTS = 4096
@@ -136,26 +137,63 @@ def shadow_error(
     """The most that closed-form radiance differs at `points`, seen from `centre` [3], without visibility."""
     if points.point.shape[1] == 0:
         return 0.0
+    view = _view(points, centre)
+    arrives = _arrival(shape, points, view, lobes, roughness, directions)
+    with_shadows, without = (_radiance(points, view, roughness, k_s, lobes, a) for a in (arrives, None))
+    return float(np.abs(with_shadows - without).max())
+
+
+def _view(points: Surface, centre: np.ndarray) -> np.ndarray:
+    """Unit vectors [3, N] from a camera at `centre` [3] to the points."""
     view = points.point - centre[:, None]
-    view /= np.linalg.norm(view, axis=0)
+    return view / np.linalg.norm(view, axis=0)
+
+
+def _arrival(shape, points: Surface, view, lobes, roughness, directions: int):
     chosen = light_directions(lobes, directions)
     scene = mi.load_dict({"type": "scene", "head": shape})
     is_open = trace_open(scene, points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
     inputs = [_tensor(v) for v in (points.normal, -view, points.specular)]
-    arrives = arrival(*inputs, mi.Float(roughness), _tensor(lobes), chosen, _tensor(is_open))
-    with_shadows, without = (_radiance(points, view, roughness, k_s, lobes, a) for a in (arrives, None))
-    return float(np.abs(with_shadows - without).max())
+    return arrival(*inputs, mi.Float(roughness), _tensor(lobes), chosen, _tensor(is_open))
+
+
+def sharing_error(
+    shape, centre: np.ndarray, lobes: np.ndarray, roughness: float, k_s: float, directions: int, reach: float
+) -> float:
+    """The most that closed-form radiance, seen from `centre` [3], changes over `reach` scene units, by its slopes
+    between corners and centres of random triangles whose normals may share a shading."""
+    corners, centres = _random_triangles(shape)
+    field, points = shape.field(), np.concatenate([centres, corners], axis=1)
+    (gradient,) = evaluate_in_chunks(lambda p: surface(field, p)[1], points)
+    normal = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+    everything = Surface(points, normal, *_albedos(shape, points), np.empty((0, points.shape[1]), int))
+    view, count = _view(everything, centre), centres.shape[1]
+    middle, corner = np.repeat(np.arange(count), 3), count + np.arange(3 * count)
+    used = (normal[:, middle] * normal[:, corner]).sum(axis=0) >= COSINE
+    used &= (view * normal).sum(axis=0)[middle] < 0
+    if not used.any():
+        return 0.0
+    arrives = _arrival(shape, everything, view, lobes, roughness, directions)
+    radiance = _radiance(everything, view, roughness, k_s, lobes, arrives)
+    change = np.abs(radiance[:, corner] - radiance[:, middle]).max(axis=0)
+    distance = np.linalg.norm(points[:, corner] - points[:, middle], axis=0)
+    return reach * float((change / np.maximum(distance, 1e-6))[used].max())
 
 
 def baking_error(shape) -> tuple[float, float]:
     """The most that diffuse and specular albedos interpolated between the vertices differ from the networks' at the
     centres of random triangles of a `neural_sdf`."""
+    corners, centres = _random_triangles(shape)
+    return tuple(
+        float(np.abs(at_corners.reshape(len(at_corners), -1, 3).mean(axis=2) - at_centres).max())
+        for at_corners, at_centres in zip(_albedos(shape, corners), _albedos(shape, centres), strict=True)
+    )
+
+
+def _random_triangles(shape) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [3, 3 T], those of a triangle consecutive, and centres [3, T] of random triangles of a `neural_sdf`."""
     faces = mi.traverse(shape)["faces"].numpy().reshape(-1, 3)
     rng = np.random.default_rng(1)
     faces = faces[rng.choice(len(faces), min(_TRIANGLES, len(faces)), replace=False)]
-    corners = shape.vertices()[:, faces.T.ravel()]
-    centres = corners.reshape(3, 3, -1).mean(axis=1)
-    return tuple(
-        float(np.abs(at_corners.reshape(len(at_corners), 3, -1).mean(axis=1) - at_centres).max())
-        for at_corners, at_centres in zip(_albedos(shape, corners), _albedos(shape, centres), strict=True)
-    )
+    corners = shape.vertices()[:, faces.ravel()]
+    return corners, corners.reshape(3, -1, 3).mean(axis=2)

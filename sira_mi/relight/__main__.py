@@ -53,7 +53,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the PNG (default: 0)")
     parser.add_argument("--background", action="store_true", help="show the environment behind the head")
     parser.add_argument(
-        "--exact", action="store_true", help="path: evaluate the albedo networks at every hit; slow (default: a vertex)"
+        "--exact",
+        action="store_true",
+        help="path: evaluate the albedo networks at every hit, not at the mesh's vertices; sg: shade every sample of a "
+        "pixel, not one for all; slow",
     )
     parser.add_argument(
         "--compare", action="store_true", help="render with both integrators under the same lobes; print the difference"
@@ -61,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--explain", action="store_true", help="say what is left out, and measure each on a small picture"
     )
-    parser.add_argument("--keep-all", action="store_true", help="leave nothing out; with path that is --exact, too")
+    parser.add_argument("--keep-all", action="store_true", help="leave nothing out; that is --exact, too")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
     return parser
 
@@ -83,8 +86,6 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError("--compare and --turntable do not go together; give one of them")
     if options.compare and (options.explain or options.keep_all):
         raise InputError("--compare leaves nothing out; --explain and --keep-all do not go with it")
-    if options.exact and options.integrator == "sg" and not options.compare:
-        raise InputError("--exact belongs to --integrator path; closed-form shading is always exact")
 
 
 def output_stem(out: Path) -> Path:

@@ -36,6 +36,7 @@ class RelightSettings:
     speculars: bool = True  # k_s r^s
     max_depth: int = -1  # path: edges from the camera to the light; -1 for any number
     visibility: bool = True  # sg: shadows and one bounce
+    shared: bool = False  # sg: samples of a pixel that see almost the same place share one shading
     extra_channels: bool = True  # sg: those that `sira_sg` gives beside the radiance
     kept_lobes: tuple[int, ...] | None = None  # numbers of the lobes that light the head; None for all
     crop: bool = False  # trace only the rectangle of the film that the head is in
@@ -79,11 +80,16 @@ def turned_scene(
         integrator["max_depth"] = settings.max_depth
         light = light.only(settings.kept_lobes)
     else:
-        integrator |= {"visibility": settings.visibility, "aovs": settings.extra_channels}
+        integrator |= {
+            "visibility": settings.visibility,
+            "aovs": settings.extra_channels,
+            "shared": settings.shared,
+        }
         if settings.kept_lobes is not None:
             integrator["shaded_lobes"] = mi.TensorXf(np.array(settings.kept_lobes, np.float32))
     view = orbited(camera, yaw_degrees)
-    eye = sensor(view)
+    # Closed forms are smooth: samples that are spread evenly serve their outlines best.
+    eye = sensor(view, {"type": "independent" if settings.integrator == "path" else "multijitter"})
     if settings.crop:
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         eye["film"] |= dict(zip(names, head_window(shape, view), strict=True))

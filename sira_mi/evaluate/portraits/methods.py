@@ -2,7 +2,8 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, and b.5 a polish after b.3.
+schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish after b.3, and b.6 is
+b.3 without shadows: all light of the upper hemisphere arrives at every point.
 """
 
 from collections.abc import Callable
@@ -29,12 +30,13 @@ class Method:
     start: Callable[[Avatar, Tensors, int], Tensors]  # (prior, tensors, seed) -> tensors before the first stage
     deforms: bool = True  # which prior: the shipped one, or the field without deformation
     after: str | None = None  # the method whose result it goes on from
+    shadows: bool = True
 
     def settings(self, settings: FitSettings) -> FitSettings:
         """The settings of a fit by this method at the quality of `settings`. Nothing ties δ to a prior where there is
         none."""
         geometry = settings.geometry if self.deforms else replace(settings.geometry, stay=0.0)
-        return replace(settings, stages=self.stages(settings.stages), geometry=geometry)
+        return replace(settings, stages=self.stages(settings.stages), geometry=geometry, shadows=self.shadows)
 
 
 def _of_kind(kind: str) -> Callable[[Stages], Stages]:
@@ -119,5 +121,6 @@ METHODS = (
     Method("b.3", "with refinement: the shipped fit", _of_kind(APPEARANCE), _unchanged, after="a.4"),
     Method("b.4", "with a relief stage", _with_relief, _unchanged, after="a.4"),
     Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
+    Method("b.6", "as b.3, without shadows", _of_kind(APPEARANCE), _unchanged, after="a.4", shadows=False),
 )
 BY_NAME = {method.name: method for method in METHODS}

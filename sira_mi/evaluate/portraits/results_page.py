@@ -15,7 +15,7 @@ from sira_mi.fit import output
 
 SHIPPED = "b.3"
 GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", "b.4")
-APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5")
+APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5", "b.6")
 _TILE = 256  # pixels, side of a picture in the sheet
 _SHEET_PORTRAITS = 6
 
@@ -284,12 +284,13 @@ def _tile(image: np.ndarray) -> np.ndarray:
 
 _ABLATIONS_TEXT = """## Ablations
 
-The methods of the paper's Figure 4 and two of this project, all at `{quality}` quality. a.1 and a.2 fit a field without
-deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves the
-deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was learned
-with the shapes, is the fit's geometry. b.1 to b.5 go on from a.4: b.1 with untrained decoders, b.2 without the
+The methods of the paper's Figure 4 and three of this project, all at `{quality}` quality. a.1 and a.2 fit a field
+without deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves
+the deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was
+learned with the shapes, is the fit's geometry. b.1 to b.6 go on from a.4: b.1 with untrained decoders, b.2 without the
 refinement, b.3 as shipped, b.4 with a relief stage before the refinement (shape from shading, which moves the surface
-too), b.5 polished by path tracing.
+too), b.5 polished by path tracing, b.6 as b.3 but with all light of the upper hemisphere at every point: no shadows,
+and no light that the head reflects onto itself.
 
 """
 

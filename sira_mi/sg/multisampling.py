@@ -1,0 +1,23 @@
+"""Samples of one pixel that see almost the same place share a shading: coverage by the sample, shading by the pixel."""
+
+import numpy as np
+
+# Samples share a shading when all of their pixel hit, none farther than this from the one in their middle, scene units,
+REACH = 0.04
+# and with normals whose cosine with that one's is at least this (15 degrees).
+COSINE = 0.966
+
+
+def leaders(position: np.ndarray, normal: np.ndarray, hit: np.ndarray, samples: int) -> np.ndarray:
+    """The number [N] of the sample whose shading each sample takes: its own, or that of the middle one of its pixel.
+    Samples of a pixel are `samples` consecutive columns of hits [3, N] with unit normals [3, N]; `hit` [N] is bool."""
+    own = np.arange(hit.size)
+    shape = hit.size // samples, samples
+    p, n = position.reshape(3, *shape), normal.reshape(3, *shape)
+    middle = ((p - p.mean(axis=2, keepdims=True)) ** 2).sum(axis=0).argmin(axis=1)[:, None]
+    at_middle = np.broadcast_to(middle, (3, *middle.shape))
+    p_middle, n_middle = (np.take_along_axis(v, at_middle, axis=2) for v in (p, n))
+    near = ((p - p_middle) ** 2).sum(axis=0) <= REACH**2
+    alike = (n * n_middle).sum(axis=0) >= COSINE
+    together = (hit.reshape(shape) & near & alike).all(axis=1, keepdims=True)
+    return np.where(together, own.reshape(shape)[:, :1] + middle, own.reshape(shape)).ravel()
