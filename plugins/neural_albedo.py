@@ -112,6 +112,7 @@ class NeuralAlbedo(mi.Texture):
         column = mi.TensorXf(z_sdf, (len(z_sdf), 1))
         self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
         self._to_local = to_local
+        self._space = (architecture, deformation, z_sdf, to_local)
 
     def bind_attribute(self, name: str) -> None:
         """Tells a baked texture the mesh attribute that its shape keeps the albedo in."""
@@ -146,12 +147,19 @@ class NeuralAlbedo(mi.Texture):
 
     def _evaluate(self, si) -> list:
         """The albedo at a surface interaction: three Floats (diffuse) or one (specular)."""
+        self._check_gradients()
+        return self._look_up(si) if self.baked else self._network_albedo(*self._place(si))
+
+    def _check_gradients(self) -> None:
         if any(now and not then for now, then in zip(self._gradients(), self._attached, strict=True)):
             raise RuntimeError("neural_albedo: gradients enabled since the last update; call params.update() first")
-        if self.baked:
-            return self._look_up(si)
+
+    def _place(self, si) -> tuple[list, list]:
+        """x_ref and γ of a surface interaction."""
+        return deform_cooperative(self._deformation, self.architecture.sdf_octaves, list(self._to_local @ si.p))
+
+    def _network_albedo(self, x_ref: list, gamma: list) -> list:
         a = self.architecture
-        x_ref, gamma = deform_cooperative(self._deformation, a.sdf_octaves, list(self._to_local @ si.p))
         if self.kind == "specular":
             return specular_albedo_cooperative(self._packed, a.specular_octaves, x_ref)
         base = diffuse_albedo_cooperative(self._packed, a.albedo_octaves, x_ref, gamma)
@@ -169,16 +177,38 @@ class NeuralAlbedo(mi.Texture):
             return [si.shape.eval_attribute_1(self._attribute, si)]
         return list(si.shape.eval_attribute_3(self._attribute, si))
 
+    def shares_space(self, other) -> bool:
+        """Whether another texture's networks take the same x_ref and γ as this one's."""
+        if not isinstance(other, NeuralAlbedo) or self.baked or other.baked:
+            return False
+        return all(a is b for a, b in zip(self._space, other._space, strict=True))
+
+    def eval_with(self, specular, si, active=True) -> tuple:
+        """What `eval` of this texture and `eval_1` of `specular`, which shares its space, give; the deformation is
+        evaluated once."""
+        self._check_gradients()
+        specular._check_gradients()
+        place = self._place(si)
+        diffuse, other = (texture._network_albedo(*place) for texture in (self, specular))
+        value = self._one(diffuse) if mi.is_monochromatic else self._three(diffuse)
+        return mi.Spectrum(value) & active, specular._one(other) & active
+
     def eval(self, si, active=True):
         return mi.Spectrum(self.eval_1(si, active)) if mi.is_monochromatic else self.eval_3(si, active)
 
     def eval_3(self, si, active=True):
-        albedo = self._evaluate(si)
-        return mi.Color3f(*albedo if len(albedo) == 3 else albedo * 3) & active
+        return self._three(self._evaluate(si)) & active
 
     def eval_1(self, si, active=True):
-        albedo = self._evaluate(si)
-        return (albedo[0] if len(albedo) == 1 else mi.luminance(mi.Color3f(*albedo))) & active
+        return self._one(self._evaluate(si)) & active
+
+    @staticmethod
+    def _three(albedo: list):
+        return mi.Color3f(*albedo if len(albedo) == 3 else albedo * 3)
+
+    @staticmethod
+    def _one(albedo: list):
+        return albedo[0] if len(albedo) == 1 else mi.luminance(mi.Color3f(*albedo))
 
     def mean(self):
         return mi.Float(0.5)

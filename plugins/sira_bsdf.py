@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.errors import InputError
+from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.sg import brdf
 
 
@@ -89,7 +90,10 @@ class SiraBSDF(mi.BSDF):
         return glossy & active, mi.Bool(ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 1)) & active
 
     def _albedos(self, si, active):
-        """Diffuse and specular albedo; networks may stand behind them, so each is asked once a call."""
+        """Diffuse and specular albedo; networks may stand behind them, so each is asked once a call, and both at once
+        where they belong to one head."""
+        if isinstance(self.diffuse_albedo, NeuralAlbedo) and self.diffuse_albedo.shares_space(self.specular_albedo):
+            return self.diffuse_albedo.eval_with(self.specular_albedo, si, active)
         return self.diffuse_albedo.eval(si, active), self.specular_albedo.eval_1(si, active)
 
     def _glossy_share(self, ctx, si, albedos):

@@ -164,3 +164,31 @@ def test_a_refinement_that_is_switched_off_is_not_evaluated(avatar, avatar_path)
 def test_another_kind_is_refused(avatar_path):
     with pytest.raises(Exception, match="diffuse"):
         texture(avatar_path, kind="shiny")
+
+
+def test_textures_of_one_head_are_evaluated_together(avatar_path):
+    """`sira_bsdf` asks both albedos of a head at once: the same values and derivatives as one by one. Textures of
+    other heads, without a head or baked do not go together."""
+    head = mi.load_dict(scenes.head(avatar_path, voxel=0.2))
+    diffuse, specular = head.bsdf().diffuse_albedo, head.bsdf().specular_albedo
+    assert diffuse.shares_space(specular)
+    results = []
+    for together in (True, False):
+        params = mi.traverse(head)
+        latents = [mi.Float(params[f"bsdf.{name}.latent"]) for name in ("diffuse_albedo", "specular_albedo")]
+        for name, latent in zip(("diffuse_albedo", "specular_albedo"), latents, strict=True):
+            dr.enable_grad(latent)
+            params[f"bsdf.{name}.latent"] = latent
+        params.update()
+        si = interaction()
+        pair = diffuse.eval_with(specular, si) if together else (diffuse.eval(si), specular.eval_1(si))
+        dr.backward(dr.sum(dr.sum(pair[0])) + dr.sum(pair[1]))
+        results.append([np.array(dr.detach(v)) for v in pair] + [dr.grad(v).numpy() for v in latents])
+    for first, second in zip(*results, strict=True):
+        np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-6)
+        assert np.ptp(first) > 1e-3
+
+    other = mi.load_dict(scenes.head(avatar_path, voxel=0.2)).bsdf().specular_albedo
+    alone = texture(avatar_path, kind="specular")
+    baked = texture(avatar_path, kind="specular", baked=True)
+    assert not any(diffuse.shares_space(one) for one in (other, alone, baked, None))
