@@ -163,9 +163,9 @@ def test_results_page_says_what_is_reached_and_what_is_missed(tmp_path, monkeypa
     failed = {"portrait": "p2", "identity": "i2", "light": "studio", "method": "a.3", "error": "no face found"}
     described = results_page.Described(tmp_path, tmp_path, "standard", "draft")
     page = results_page.write_results(rows(), [*rows(), failed], described, tmp_path).read_text()
-    assert "| face, both directions, mm | ≤ 1.0 | 0.85 | reached |" in page
+    assert "| face, both directions, mm | ≤ 1 | 0.85 | reached |" in page
     assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in page
-    assert "| final render, dB | ≥ 34 | 0.8 | missed |" in page
+    assert "| final render, dB | ≥ 34 | 0.8 | **missed** by 33.1 |" in page
     assert "| a.4 minus the best of a.1 to a.3, mm | ≤ 0 | – | – |" in page
     assert "| time of a fit, s | ≤ 300 | 41 | reached |" in page
     assert "| p2 | a.3 | no face found |" in page

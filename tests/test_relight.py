@@ -213,6 +213,16 @@ def test_a_turntable_is_a_full_turn(avatar_path, lights, tmp_path, voxel, capsys
     assert (images[1] == images[2]).all() and (images[0] != images[1]).any()
 
 
+def test_a_draft_is_close_to_the_closed_form(avatar_path, lights, tmp_path, voxel):
+    """The mesh shaded once a pixel, of a smooth blob: not the same picture, and near to it."""
+    common = ["--lights", lights, "--integrator", "sg", "--spp", "4", "--size", "96"]
+    for name, options in (("full", []), ("draft", ["--draft"])):
+        assert main([avatar_path, *common, *options, "--out", str(tmp_path / name)]) == 0
+    full, draft = (mi.TensorXf(mi.Bitmap(str(tmp_path / f"{name}.exr"))).numpy() for name in ("full", "draft"))
+    difference = np.abs(full - draft)[full.max(axis=2) > 0]
+    assert 0 < difference.mean() < 0.03 * full[full > 0].mean()
+
+
 def test_the_comparison_prints_its_figures(avatar_path, lights, tmp_path, voxel, capsys):
     assert (
         main([avatar_path, "--lights", lights, "--compare", "--spp", "8", "--size", "24", "--out", str(tmp_path / "c")])
@@ -244,6 +254,7 @@ def test_the_comparison_prints_its_figures(avatar_path, lights, tmp_path, voxel,
         ({"--seed": "-1"}, "--seed is -1"),
         ({"--turntable": "0"}, "--turntable is 0"),
         ({"--integrator": "magic"}, "invalid choice"),
+        ({"--draft": None}, "belongs to --integrator sg"),
         ({"--variant": "magic"}, "no variant magic"),
         ({"--out": "no such folder/x"}, "cannot write to"),
         ({"--out": "x.jpg"}, r"ends in \.jpg"),
@@ -268,7 +279,7 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     out = tmp_path / "out"
     out.mkdir()
     options["--out"] = str(out / options["--out"])
-    arguments = [options.pop("avatar"), *(text for pair in options.items() for text in pair)]
+    arguments = [options.pop("avatar"), *(text for pair in options.items() for text in pair if text is not None)]
     with pytest.raises(InputError, match=message) as error:
         main(arguments)
     assert "\n" not in str(error.value)

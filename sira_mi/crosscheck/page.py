@@ -328,18 +328,18 @@ LDR-FLIP (Andersson et al. 2020) over the head, on sRGB values, at 67 pixels a d
 
 The methods: (a) PhySG's closed form, with its two-term cosine; (b) this project's closed form; (c) the same with
 visibility, `sira_sg`, also with fewer shadings and on the mesh; (d) direct light by Monte Carlo, `path` with
-`max_depth` 2; (e) `path` of one bounce and of all. All see the lobes of `sira_mi/crosscheck/lights.py` and `sira_bsdf`.
-Samples of closed forms are spread evenly over each pixel, those of `path` are independent. The path tracer sees a mesh
-of spacing {voxel} with albedos at its vertices, the closed forms the field and its networks. How well the closed form
-approximates the integral
-alone is in [shading.md](shading.md)."""
+`max_depth` 2; (e) `path` of one bounce and of all. All see the lobes of `sira_mi/crosscheck/lights.py` and
+`sira_bsdf`. Samples of closed forms are spread evenly over each pixel, those of `path` are independent. The path
+tracer sees a mesh of spacing {voxel} with albedos at its vertices, the closed forms the field and its networks. How
+well the closed form approximates the integral alone is in [shading.md](shading.md)."""
 
 _MARKS_TEXT = """Neural textures inside `path` are networks evaluated at every hit of every sample: that is what the
 first ratio of textures shows, and why baked ones are the default of `python -m sira_mi.relight`. `sira_sg` finds exact
-hits and evaluates the field's networks with its gradient at each of them, which the path tracer with baked albedos does
-without. "Shared": samples of one pixel that see almost the same place share one shading (its option `shared`, which
-`python -m sira_mi.relight` uses). "On the mesh, baked": hits, normals and albedos of the mesh that the path tracer sees
-(its option `exact`, switched off)."""
+hits and evaluates the field's networks with its gradient at each of them, which the path tracer with baked albedos
+does without. "Shared": samples of one pixel that see almost the same place share one shading (its option `shared`,
+which `python -m sira_mi.relight --draft` uses); it samples what varies within a pixel once, as the albedo of a fit
+with fine detail does and the mean head's does not. "On the mesh, baked": hits, normals and albedos of the mesh that
+the path tracer sees (its option `exact`, switched off)."""
 
 _REFERENCES_TEXT = """`path` with all bounces, in passes of independent seeds, until the standard error of the picture
 that the variance among the passes shows (root mean square over the head, share of the mean radiance) is below {bound}%,

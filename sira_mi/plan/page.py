@@ -143,9 +143,8 @@ each decision, `--keep-all` switches it off, and a fit keeps it in `avatar.json`
     python -m sira_mi.plan AVATAR
 
 Errors of pictures are radiances in units of that of a white diffuse surface which faces the light best. No decision is
-taken whose bound exceeds {TOLERANCE:g}, but two, which `--exact` undoes: albedos at the vertices instead of networks at
-every hit, the default of path tracing, and one shading for samples of a pixel that see almost the same place, the
-default of closed-form pictures. A bound is on every pixel; what was measured is the root mean square over the
+taken whose bound exceeds {TOLERANCE:g}, but one: albedos at the vertices instead of networks at every hit, the default
+of path tracing, which `--exact` undoes. A bound is on every pixel; what was measured is the root mean square over the
 head in a picture of {size} pixels, each decision alone. Where random numbers change along (path tracing; a smaller
 film), two seeds of the full picture differ by the "noise" too. The time is the processor's, the median of three pairs
 of runs in turn after one that does not count, and half the range of the pairs. Networks at every hit are measured in a
@@ -168,7 +167,8 @@ What the bounds rest on:
   0 is not enough: the Fresnel term still reflects at grazing angles.
 - **networks at every hit**: the largest difference of the albedos at the centres of 4096 triangles.
 - **a shading for every sample**: the steepest change of radiance, shadows included, between corners and centres of 4096
-  triangles, over as far as samples that share a shading may be apart.
+  triangles, over as far as samples that share a shading may be apart. A head has steeper places than that; `--draft`
+  shares shadings whatever it costs.
 - **pixels beside the head**: no ray outside the rectangle of the mesh can meet the head. Nothing but the random numbers
   changes.
 

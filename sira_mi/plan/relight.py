@@ -49,8 +49,8 @@ def plan_relight(
     exact: bool = False,
 ) -> Plan:
     """The decisions about pictures of `shape` (of `load_head`) at some `yaws`, degrees, with errors up to `tolerance`
-    each. `settings` are those that leave nothing out, which `Plan.apply` changes. Baked albedos in path tracing and
-    shared shadings in closed form are left out whatever their error, unless `exact` pictures are asked for."""
+    each. `settings` are those that leave nothing out, which `Plan.apply` changes. Baked albedos, the default of path
+    tracing, are a decision whatever their error, unless `exact` ones are asked for."""
     avatar, path = subject.avatar, settings.integrator == "path"
     points = sample_surface(shape)
     lobes = image_lobes(light.image) if light.lobes is None else light.lobes
@@ -73,7 +73,7 @@ def plan_relight(
     else:
         decisions += [
             _visibility(shape, points, subject, lobes, white, limit, views),
-            _shadings(shape, subject, lobes, white, settings, views, exact),
+            _shadings(shape, subject, lobes, white, limit, settings, views),
             Decision(
                 "extra channels", _PICTURE, True, "only the radiance is written", changes={"extra_channels": False}
             ),
@@ -178,10 +178,10 @@ def _visibility(shape, points, subject, lobes, white, limit, views):
     return Decision("visibility", _PICTURE, worst <= limit, reason, worst / white, changes=changes)
 
 
-def _shadings(shape, subject, lobes, white, settings, views, exact):
+def _shadings(shape, subject, lobes, white, limit, settings, views):
     name = "a shading for every sample"
-    if exact:
-        return Decision(name, _PICTURE, False, "asked for by --exact")
+    if settings.shared:
+        return Decision(name, _PICTURE, True, "asked for by --draft", built_in=True)
     if settings.samples == 1:
         return Decision(name, _PICTURE, False, "there is one sample a pixel")
     avatar, worst = subject.avatar, 0.0
@@ -193,8 +193,10 @@ def _shadings(shape, subject, lobes, white, settings, views, exact):
             shape, camera.centre, _lobes_at(lobes, yaw), avatar.roughness, avatar.k_s, _DIRECTIONS, reach
         )
         worst = max(worst, error)
-    reason = f"radiance within a pixel differs by up to {worst / white:.1e} of white; --exact shades every sample"
-    return Decision(name, _PICTURE, True, reason, worst / white, changes={"shared": True})
+        if worst > limit:
+            break
+    reason = f"radiance within a pixel differs by up to {worst / white:.1e} of white"
+    return Decision(name, _PICTURE, worst <= limit, reason, worst / white, changes={"shared": True})
 
 
 def _outside(subject, shape, settings, yaws):

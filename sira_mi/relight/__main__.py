@@ -18,7 +18,7 @@ The head turns under a light that stays fixed to the world, as does the camera. 
 _EPILOG = """\
 examples:
   python -m sira_mi.relight avatar --lights scenes/lights/studio.exr --out relit.png
-  python -m sira_mi.relight avatar --integrator sg --turntable 48 --out turn
+  python -m sira_mi.relight avatar --integrator sg --draft --turntable 48 --out turn
   python -m sira_mi.relight avatar --compare --out check"""
 _SAMPLES = {"path": 64, "sg": 8}
 _MAXIMUM_SIZE = 8192
@@ -53,10 +53,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the PNG (default: 0)")
     parser.add_argument("--background", action="store_true", help="show the environment behind the head")
     parser.add_argument(
-        "--exact",
-        action="store_true",
-        help="path: evaluate the albedo networks at every hit, not at the mesh's vertices; sg: shade every sample of a "
-        "pixel, not one for all; slow",
+        "--exact", action="store_true", help="path: evaluate the albedo networks at every hit; slow (default: a vertex)"
+    )
+    parser.add_argument(
+        "--draft", action="store_true", help="sg: shade the mesh instead of the field, once a pixel; quick, less detail"
     )
     parser.add_argument(
         "--compare", action="store_true", help="render with both integrators under the same lobes; print the difference"
@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--explain", action="store_true", help="say what is left out, and measure each on a small picture"
     )
-    parser.add_argument("--keep-all", action="store_true", help="leave nothing out; that is --exact, too")
+    parser.add_argument("--keep-all", action="store_true", help="leave nothing out; with path that is --exact, too")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
     return parser
 
@@ -80,6 +80,10 @@ def _check(options: argparse.Namespace) -> None:
     _check_range("turntable", options.turntable, 1, _MAXIMUM_FRAMES)
     _check_range("seed", options.seed, 0, 2**32 - 1)
     _check_range("exposure", options.exposure, -30, 30)
+    if options.exact and options.integrator == "sg" and not options.compare:
+        raise InputError("--exact belongs to --integrator path; closed-form shading is exact without --draft")
+    if options.draft and (options.integrator == "path" or options.compare):
+        raise InputError("--draft belongs to --integrator sg alone")
     if not math.isfinite(options.yaw):
         raise InputError(f"--yaw is {options.yaw}; it must be a number of degrees")
     if options.compare and options.turntable:
@@ -144,6 +148,8 @@ def main(arguments: list[str] | None = None) -> int:
         seed=options.seed,
         exact=options.exact,
         background=options.background,
+        shared=options.draft,
+        on_mesh=options.draft,
     )
     subject = read_subject(options.avatar, options.size)
     light = read_light(options.lights, subject.avatar, lobes=options.compare or options.integrator == "sg")

@@ -37,6 +37,7 @@ class RelightSettings:
     max_depth: int = -1  # path: edges from the camera to the light; -1 for any number
     visibility: bool = True  # sg: shadows and one bounce
     shared: bool = False  # sg: samples of a pixel that see almost the same place share one shading
+    on_mesh: bool = False  # sg: hits, normals and albedos of the mesh instead of the field's
     extra_channels: bool = True  # sg: those that `sira_sg` gives beside the radiance
     kept_lobes: tuple[int, ...] | None = None  # numbers of the lobes that light the head; None for all
     crop: bool = False  # trace only the rectangle of the film that the head is in
@@ -55,7 +56,7 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
     bsdf = description["bsdf"]
     bsdf["roughness"] = subject.avatar.roughness
     bsdf["k_s"] = subject.avatar.k_s if settings.speculars else 0.0
-    if settings.integrator == "path" and not settings.exact:
+    if settings.on_mesh if settings.integrator == "sg" else not settings.exact:
         for texture in ("diffuse_albedo", "specular_albedo"):
             bsdf[texture]["baked"] = True
     if settings.integrator == "path" and not settings.speculars:
@@ -84,6 +85,7 @@ def turned_scene(
             "visibility": settings.visibility,
             "aovs": settings.extra_channels,
             "shared": settings.shared,
+            "exact": not settings.on_mesh,
         }
         if settings.kept_lobes is not None:
             integrator["shaded_lobes"] = mi.TensorXf(np.array(settings.kept_lobes, np.float32))
