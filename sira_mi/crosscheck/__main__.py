@@ -61,11 +61,11 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _command(arguments: list[str]) -> str:
-    """The command of the page: without the folders that change nothing in it."""
+    """The command of the page: without the folders that change nothing in it, and rows by QUALITY/rows.json alone."""
     parts, skipped = ["python", "-m", "sira_mi.crosscheck"], False
     for argument in arguments:
         if not skipped and argument.split("=")[0] not in ("--out", "--evidence"):
-            parts.append(argument)
+            parts.append(f"RUNS/{'/'.join(Path(argument).parts[-2:])}" if argument.endswith("rows.json") else argument)
         skipped = argument in ("--out", "--evidence")
     return shlex.join(parts)
 
