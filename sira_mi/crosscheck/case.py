@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,13 +32,6 @@ class Case:
     to_world: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4] of the head
     others: tuple = ()  # further shapes of the scene
     lobes: np.ndarray | None = None  # [N_l, 7] of the scene's own light, in world coordinates
-
-    def resized(self, size: int) -> Case:
-        """The same view on a film whose longer side has `size` pixels."""
-        scale = size / max(self.width, self.height)
-        width, height = (max(1, round(side * scale)) for side in (self.width, self.height))
-        sensor = {**self.sensor, "film": scenes.film(width, height)}
-        return dataclasses.replace(self, sensor=sensor, width=width, height=height)
 
     def head(self, voxel: float, baked: bool = True) -> mi.Shape:
         """The head as a shape whose mesh has the spacing `voxel` (scene units), its albedos kept at the vertices or

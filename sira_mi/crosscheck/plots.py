@@ -100,8 +100,8 @@ def plot_fits(points: Sequence[FitPoint], path: Path) -> None:
         axis.plot([p.seconds for p in points], [getattr(p, name) for p in points], marker="o", color="tab:blue")
         for p in points:
             axis.annotate(p.label, (p.seconds, getattr(p, name)), textcoords="offset points", xytext=(4, 4))
-        axis.set(xscale="log", xlabel="wall time of a fit, s", ylabel=label)
-    axes[0].set_yscale("log")
+        axis.set(xlabel="wall time of a fit, s", ylabel=label, xlim=(0, 1.3 * max(p.seconds for p in points)))
+    axes[0].set_ylim(0, 1.2 * max(p.millimetres for p in points))
     figure.tight_layout()
     _save(figure, path)
     plt.close(figure)

@@ -25,8 +25,8 @@ from sira_mi.sg.lobes import evaluate_lobes
 from sira_mi.sg.shading import shade
 
 _REPEATS = 5
-# Pixels, longer side of the picture that is path-traced with networks, and its samples a pixel.
-_NEURAL_SIZE, _NEURAL_SAMPLES = 64, 4
+# Samples a pixel of the picture that is path-traced with networks.
+_NEURAL_SAMPLES = 4
 _TEXTURE_SIZE = 512  # pixels
 _ENVIRONMENT = (64, 128)  # height and width
 LOBE_COUNTS = (8, 32, 128)
@@ -128,15 +128,14 @@ def texture_ratios(case: Case, usual: mi.Shape, lobes: np.ndarray, samples: int)
     runs["baked, envmap"] = case.scene(usual, lobes, _environment(lobes))
     runs["attribute principled, envmap"] = case.scene(shapes["attribute principled"], lobes, _environment(lobes))
     times = interleaved({k: lambda s=s: render(s, integrator, samples, 5) for k, s in runs.items()})
-    # Networks take long: a small picture has to do. Stock Mitsuba's turn is before there is a head with networks,
-    # because the kernels of every picture hold those of all heads that are alive.
-    small = case.resized(min(_NEURAL_SIZE, max(case.width, case.height)))
+    # Networks take long: few samples have to do. Stock Mitsuba's turn is before there is a head with networks, because
+    # the kernels of every picture hold those of all heads that are alive.
     few = {}
     for name, shape in (
         ("stock", lambda: shapes["bitmap principled"]),
         ("neural", lambda: case.head(usual.voxel, False)),
     ):
-        scene = small.scene(shape(), lobes)
+        scene = case.scene(shape(), lobes)
         few |= interleaved({name: lambda scene=scene: render(scene, integrator, _NEURAL_SAMPLES, 5)}, 3)
 
     def ratio(name, first, second, mark=None):
