@@ -73,7 +73,8 @@ class NeuralAlbedo(mi.Texture):
     appended where several baked textures of one kind share a head) and renews it whenever parameters are changed
     through the scene or the shape. It is as sharp as the mesh is fine: give the shape a `voxel` of 0.03 or less. It is
     detached: no gradient reaches this texture's parameters, and enabling one raises RuntimeError at the next render.
-    Outside of a `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case.
+    Outside of a `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case, unless its
+    `exact` is switched off.
 
     Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
 

@@ -45,8 +45,8 @@ class SiraSG(mi.SamplingIntegrator):
          baked: quicker, and as good as the shape's `voxel` is fine. (Default: true)
      * - shared
        - |bool|
-       - Samples of one pixel that all see the head within 4 mm, with normals within 15 degrees, are shaded once, at
-         the one in their middle; what the head covers is still found by the sample. (Default: false)
+       - Samples of one pixel that all see the head within 4 mm of the field, with normals within 15 degrees, are shaded
+         once, at the one in their middle; what the head covers is still found by the sample. (Default: false)
      * - shaded_lobes
        - |tensor|
        - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. (Default: all)
@@ -110,7 +110,7 @@ class SiraSG(mi.SamplingIntegrator):
             surface_hits, hit = mesh_hits(scene, head, ray, active)
             t, shaded = surface_hits.t, hit
             if shared:
-                arrays = (surface_hits.p, surface_hits.sh_frame.n, hit)
+                arrays = (head.to_local @ surface_hits.p, surface_hits.sh_frame.n, hit)
                 leader = mi.UInt32(multisampling.leaders(*(a.numpy() for a in arrays), samples))
                 shaded = hit & (leader == dr.arange(mi.UInt32, width))
             t, hit = head.refine(ray, t, shaded) if self.exact else (t, shaded)
