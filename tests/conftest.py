@@ -1,18 +1,22 @@
-"""A small smooth head for the tests of fields, plugins and models, and the comparison of gradients with differences."""
+"""A small smooth head for the tests of fields, plugins and models, the comparison of gradients with differences, and a
+face for those of the portrait."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
 # isort: split
 import dataclasses
 
+import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
+import skimage.data
 
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.fit.settings import QUALITIES, FitSettings
 from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.face import find_faces
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -155,3 +159,38 @@ def camera(focal: float, size: int = 32) -> Camera:
     k = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     world_to_camera = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 5], [0, 0, 0, 1]])
     return Camera(k, world_to_camera, size, size)
+
+
+@pytest.fixture(scope="session")
+def astronaut():
+    return skimage.data.astronaut()
+
+
+@pytest.fixture(scope="session")
+def face(astronaut):
+    return find_faces(astronaut)[0]
+
+
+@pytest.fixture(scope="session")
+def head(face):
+    """A head's landmarks [468, 3] in world units, back-projected from the network's relative depth."""
+    eyes = face.landmarks[[33, 263]]
+    scale = 0.9 / np.linalg.norm(eyes[1] - eyes[0])
+    flat = (face.landmarks - eyes.mean(axis=0)) * scale
+    return np.column_stack([flat[:, 0], -flat[:, 1], 0.8 - face.depth * scale])
+
+
+def one_line(error: pytest.ExceptionInfo, *words: str) -> None:
+    message = str(error.value)
+    assert "\n" not in message and len(message) < 700
+    for word in words:
+        assert word in message
+
+
+def a_camera(head=None, yaw=20.0, pitch=-8.0, roll=5.0, distance=9.0, focal=900.0, size=(640, 800)) -> Camera:
+    turn = cv2.Rodrigues(np.radians([0, yaw, 0]))[0] @ cv2.Rodrigues(np.radians([pitch, 0, roll]))[0]
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([1.0, -1.0, -1.0]) @ turn
+    pose[:3, 3] = (0.4, -0.7, distance)
+    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
+    return Camera(K, pose, *size)
