@@ -60,7 +60,7 @@ def variant():
 
 def tiny_fit(steps: int) -> FitSettings:
     """A fit of `steps` steps a stage: every stage and every file is real, only too short to look good."""
-    stages = tuple((kind, dataclasses.replace(stage, steps=steps)) for kind, stage in QUALITIES["draft"].stages)
+    stages = tuple((kind, dataclasses.replace(stage, steps=steps)) for kind, stage in QUALITIES["standard"].stages)
     sizes = {"working_size": 128, "rays": 256, "points": 64, "pixels": 256, "voxel": 0.16, "final_voxel": 0.12}
     return FitSettings("tiny", **sizes, stages=stages, block=3)
 

@@ -54,8 +54,9 @@ def test_a_method_and_what_it_goes_on_from_take_the_steps_of_the_fit():
             assert steps == lengths[GEOMETRY]
         elif method.name in ("b.1", "b.3"):
             assert steps == lengths[APPEARANCE]
-    shipped = BY_NAME["a.4"].settings(DRAFT).stages + BY_NAME["b.3"].settings(DRAFT).stages
-    assert shipped == DRAFT.stages
+    for quality in QUALITIES.values():
+        shipped = BY_NAME["a.4"].settings(quality).stages + BY_NAME["b.3"].settings(quality).stages
+        assert shipped == quality.stages
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import numpy as np
 from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, refined_albedo
 from sira_mi.fields.sdf import evaluate_in_chunks, in_three
 from sira_mi.fit.settings import FitSettings, Stage
-from sira_mi.fit.shaded import base_albedo, decoder, photo_points, shade_points, skin_patches
+from sira_mi.fit.shaded import base_albedo, decoder, photo_points, shade_points
+from sira_mi.fit.skin import skin_patches
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar
 from sira_mi.plan.decisions import Plan
@@ -61,7 +62,7 @@ class AppearanceProblem:
         """Base albedo [3, n] at the points `index` and the loss of the skin's tone (None without skin); of a stage that
         holds both fixed, both are evaluated once."""
         if not self.plan.leaves_out(BASE_ALBEDO, stage.name):
-            skin = None if self.skin is None else self.skin.loss(self.avatar, current)
+            skin = self._skin_loss(current)
             return base_albedo(self.avatar, current, self.points[index]), skin
         if self._base is None:
             a, points = self.avatar.architecture, self.points
@@ -69,10 +70,14 @@ class AppearanceProblem:
             (base,) = evaluate_in_chunks(
                 lambda x_ref, gamma: diffuse_albedo(network, a.albedo_octaves, x_ref, gamma), points.x_ref, points.gamma
             )
-            skin = None if self.skin is None else self.skin.loss(self.avatar, self._fixed)
-            self._base = base, skin
+            self._base = base, self._skin_loss(self._fixed)
         base, skin = self._base
         return mi.TensorXf(np.ascontiguousarray(base[:, index])), skin
+
+    def _skin_loss(self, current: dict):
+        if self.skin is None:
+            return None
+        return self.skin.loss(self.avatar, current, self.settings.appearance.dark_skin)
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights, a = self.settings.appearance, self.avatar.architecture

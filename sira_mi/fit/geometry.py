@@ -15,6 +15,7 @@ from sira_mi.fields.columns import to_columns
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, rigid_motion, surface
 from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
+from sira_mi.fit.skin import face_exposure
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar, signed_distance_field
 from sira_mi.portrait.camera import Camera, landmark_weights
@@ -46,7 +47,9 @@ class GeometryProblem:
         self.parameters = mi.traverse(self.scene)
         self.head.remesh_every = 1 << 30
         mask = np.where(self.valid, portrait.mask, 0)
-        self.target = np.concatenate([portrait.image, mask[..., None]], axis=-1).astype(np.float32)
+        # An untrained rendering function expects no exposure.
+        self.exposure = 1.0 if "rendering" in settings.stages[0][1].rates else face_exposure(portrait)
+        self.target = np.concatenate([self.exposure * portrait.image, mask[..., None]], axis=-1).astype(np.float32)
         self.landmarks = self._landmarks(avatar)
 
     def _windows(self, size: int):
@@ -92,8 +95,12 @@ class GeometryProblem:
         }
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Nothing is known in closed form."""
-        return {}
+        """Before the first stage, the learned radiance is scaled to the photo's exposure."""
+        if stage != self.settings.stages[0][1]:
+            return {}
+        rendering = tensors["rendering"].copy()
+        rendering[-3:] -= np.float32(np.log(self.exposure))
+        return {"rendering": rendering}
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Extracts the mesh that rays start from at the current parameters. Raises EmptySurfaceError."""
@@ -126,7 +133,7 @@ class GeometryProblem:
         return terms
 
     def _image_losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator):
-        """Photometric and mask loss on the rays of one window."""
+        """Photometric loss, at the exposure of the training's photos, and mask loss on the rays of one window."""
         for name, value in tensors.items():
             self.parameters[_PARAMETERS[name]] = value
         self.parameters.update()
@@ -145,7 +152,7 @@ class GeometryProblem:
         ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(direction.T))
         radiance, hit, (_, closest) = self.scene.integrator().sample(self.scene, None, ray)
         covered = hit.numpy() & (target[3] > 0.5)
-        difference = losses.display(to_columns(radiance)) - losses.display(mi.TensorXf(target[:3]))
+        difference = losses.display(self.exposure * to_columns(radiance)) - losses.display(mi.TensorXf(target[:3]))
         weight = mi.TensorXf(np.broadcast_to(covered / (3 * max(covered.sum(), 1)), (3, len(rows))).astype(np.float32))
         color = dr.sum(dr.abs(difference) * weight, axis=None)
 

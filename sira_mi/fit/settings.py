@@ -36,10 +36,14 @@ class AppearanceWeights:
 
     lambda_8: float = 0.5  # eq. 13, refinement in shadows
     lambda_9: float = 1.0  # eq. 13, refinement in reflections
-    refinement: float = 0.05  # eq. 12
+    refinement: float = 0.1  # eq. 12
     embedding: float = 1e-5  # on ‖z‖²
-    white_light: float = 0.02  # mean squared log-chroma of the lobes: the prior on the light's colour
+    white_light: float = 0.005  # mean squared log-chroma of the lobes: the prior on the light's colour
     skin_tone: float = 2e-3  # on the deviation of the skin's albedo from measured skin, in standard deviations
+    # Part of the log luminance by which skin is darker in the photo than in usual ones that is put down to the skin
+    # rather than to the light: by the variances where log skin varies by 0.5 and the log light on a face by 0.8. Photos
+    # are not exposed for more than their brightest parts, so that skin that is brighter is lighter skin.
+    dark_skin: float = 0.3
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
 
 
@@ -81,9 +85,9 @@ class FitSettings:
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
-def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]:
-    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales. Geometry that is fitted for
-    longer follows the photo further from the prior, on some heads away from the person."""
+def _stages(geometry: float, appearance: float, relief: int = 0) -> tuple[tuple[str, Stage], ...]:
+    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales, and so many steps of relief.
+    Geometry that is fitted for longer follows the photo further from the prior, on some heads away from the person."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)
@@ -92,7 +96,7 @@ def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]
         return round(count * appearance)
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
-    return (
+    stages = (
         (GEOMETRY, Stage("latents", shape_steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
         (
             GEOMETRY,
@@ -133,11 +137,12 @@ def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]
             ),
         ),
     )
+    return with_relief(stages, relief) if relief else stages
 
 
 def with_relief(stages: tuple[tuple[str, Stage], ...], steps: int) -> tuple[tuple[str, Stage], ...]:
-    """The stages with a relief stage of so many steps before the refinement, which no shipped quality has: it helps the
-    albedo and, so far, not the surface."""
+    """The stages with a relief stage of so many steps before the refinement: normals that answer to the photo's shading
+    leave less of it to the albedo."""
     rates = {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2}
     stage = Stage("relief", steps, rates, k_s=(1.0, 1.0))
     first = next(number for number, (_, other) in enumerate(stages) if other.k_r > 0)
@@ -165,6 +170,6 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 QUALITIES = {
     "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.35, 1.0, 160)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.35, 2.5, 160)),
 }

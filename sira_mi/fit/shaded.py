@@ -7,15 +7,12 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
-from sira_mi.models.af_sm import AppearanceTraining, diffuse_radiance, physical_radiance
+from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
 from sira_mi.models.avatar import Avatar
-from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
@@ -24,8 +21,6 @@ from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, diffuse_arrival, even_
 
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
-# Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
-_SKIN_REACH = 0.04
 
 
 @dataclass(frozen=True)
@@ -80,39 +75,6 @@ def photo_points(portrait: Portrait, head, shadows: bool = True) -> PhotoPoints:
     place = seen.origin + seen.t * seen.view
     is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel)
     return PhotoPoints(**vars(seen), is_open=is_open)
-
-
-@dataclass(frozen=True)
-class SkinPatches:
-    """Points of bare facial skin in a photo, which settle the level of the light against the albedo's."""
-
-    points: SeenPoints  # one a landmark
-    radiance: float  # luminance of the photo about them, geometric mean
-
-    def loss(self, avatar: Avatar, tensors: dict):
-        """`skin_tone_loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
-        settings, count = AppearanceTraining(), len(self.points.row)
-        albedo = base_albedo(avatar, tensors, self.points)
-        weight = mi.TensorXf(np.full((1, count), 1 / count, np.float32))
-        usual, deviations = settings.skin_radiance, settings.skin_deviations
-        return skin_tone_loss(albedo, weight, np.array([self.radiance]), usual, deviations)
-
-
-def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:
-    """The points nearest to the photo's landmarks of bare skin; None without a face or where none is seen."""
-    landmarks = portrait.landmarks[list(SKIN_LANDMARKS)]
-    landmarks = landmarks[np.isfinite(landmarks).all(axis=1)]
-    if not len(landmarks) or not len(points.row):
-        return None
-    reach = _SKIN_REACH * float(np.ptp(portrait.landmarks[np.isfinite(portrait.landmarks[:, 1]), 1]))
-    tree = cKDTree(np.stack([points.column, points.row], axis=1) + 0.5)
-    distance, nearest = tree.query(landmarks)
-    if not (distance < reach).any():
-        return None
-    around = np.unique(np.concatenate(tree.query_ball_point(landmarks[distance < reach], reach)).astype(int))
-    luminance = portrait.image[points.row[around], points.column[around]] @ np.array(LUMINANCE)
-    level = float(np.exp(np.log(np.maximum(luminance, 1e-3)).mean()))
-    return SkinPatches(points[nearest[distance < reach]], level)
 
 
 def decoder(avatar: Avatar, name: str, tensors: dict, latent: str | None = None) -> list[tuple]:

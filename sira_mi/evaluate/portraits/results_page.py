@@ -288,9 +288,10 @@ The methods of the paper's Figure 4 and three of this project, all at `{quality}
 without deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves
 the deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was
 learned with the shapes, is the fit's geometry. b.1 to b.6 go on from a.4: b.1 with untrained decoders, b.2 without the
-refinement, b.3 as shipped, b.4 with a relief stage before the refinement (shape from shading, which moves the surface
-too), b.5 polished by path tracing, b.6 as b.3 but with all light of the upper hemisphere at every point: no shadows,
-and no light that the head reflects onto itself. A method without a row was left out by `--methods`.
+refinement, b.3 as shipped at that quality, b.4 with a relief stage before the refinement (shape from shading, which
+moves the surface too; every quality but `draft` ships with it), b.5 polished by path tracing, b.6 as b.3 but with all
+light of the upper hemisphere at every point: no shadows, and no light that the head reflects onto itself. A method
+without a row was left out by `--methods`.
 
 """
 
