@@ -85,9 +85,9 @@ class FitSettings:
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
-def _stages(geometry: float, appearance: float, relief: int = 0) -> tuple[tuple[str, Stage], ...]:
-    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales, and so many steps of relief.
-    Geometry that is fitted for longer follows the photo further from the prior, on some heads away from the person."""
+def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]:
+    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales. Geometry that is fitted for
+    longer follows the photo further from the prior, on some heads away from the person."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)
@@ -96,7 +96,7 @@ def _stages(geometry: float, appearance: float, relief: int = 0) -> tuple[tuple[
         return round(count * appearance)
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
-    stages = (
+    return (
         (GEOMETRY, Stage("latents", shape_steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
         (
             GEOMETRY,
@@ -137,12 +137,12 @@ def _stages(geometry: float, appearance: float, relief: int = 0) -> tuple[tuple[
             ),
         ),
     )
-    return with_relief(stages, relief) if relief else stages
 
 
 def with_relief(stages: tuple[tuple[str, Stage], ...], steps: int) -> tuple[tuple[str, Stage], ...]:
-    """The stages with a relief stage of so many steps before the refinement: normals that answer to the photo's shading
-    leave less of it to the albedo."""
+    """The stages with a relief stage of so many steps before the refinement, which no shipped quality has: on rendered
+    portraits it helps normals and albedo, but a real photo's hair, eyes and smile, which the albedo's prior cannot
+    paint, it takes for shape."""
     rates = {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2}
     stage = Stage("relief", steps, rates, k_s=(1.0, 1.0))
     first = next(number for number, (_, other) in enumerate(stages) if other.k_r > 0)
@@ -170,6 +170,6 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 QUALITIES = {
     "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.35, 1.0, 160)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.35, 2.5, 160)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.35, 1.0)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.35, 2.5)),
 }

@@ -2,7 +2,7 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage where it ships without, b.5 a polish
+schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish
 after b.3, and b.6 is b.3 without shadows: all light of the upper hemisphere arrives at every point.
 """
 
@@ -85,7 +85,7 @@ def _without_prior(shipped: Stages) -> Stages:
 
 
 def _with_relief(shipped: Stages) -> Stages:
-    """As many relief steps as the albedo stage has, as in the longer qualities; a draft ships without."""
+    """As many relief steps as the albedo stage has; no shipped quality has the stage."""
     stages = _of_kind(APPEARANCE)(shipped)
     return with_relief(stages, next(stage.steps for _, stage in stages if stage.name == "albedo"))
 
