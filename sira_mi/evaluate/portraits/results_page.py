@@ -342,7 +342,7 @@ fit sees the photo and its EXIF focal length; camera, mask and landmarks are its
     python -m sira_mi.evaluate fits --benchmark BENCHMARK --runs RUNS --prior-without-deformation PRIOR
 
 **The rows at `standard` are of fits with a relief stage of 160 steps and 182 steps of geometry. Shipped are none and
-260**: relief takes a real photo's hair, eyes and smile for shape, which the portraits of this benchmark do not show, and
+260**: relief takes a real photo's hair, eyes and smile for shape, which this benchmark does not show, and
 182 steps leave a crease between hair and brow there. The rows of the shipped `standard` are still to be measured; b.3
 against b.4 among the ablations, both at `draft`, says what to expect: 0.05 mm of the face, 0.4° of the normals,
 0.5 dB of the diffuse albedo and 1.0 dB of it scaled."""
