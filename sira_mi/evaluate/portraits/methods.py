@@ -2,8 +2,8 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish
-after b.3, and b.6 is b.3 without shadows: all light of the upper hemisphere arrives at every point.
+schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish after b.3, and b.6 is
+b.3 without shadows: all light of the upper hemisphere arrives at every point.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, RELIEF, FitSettings, Stage, polish_stage, with_relief
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage, polish_stage, with_relief
 from sira_mi.models.af_sm import initial_appearance_model
 from sira_mi.models.avatar import Avatar
 
@@ -39,8 +39,8 @@ class Method:
         return replace(settings, stages=self.stages(settings.stages), geometry=geometry, shadows=self.shadows)
 
 
-def _of_kind(*kinds: str) -> Callable[[Stages], Stages]:
-    return lambda stages: tuple(entry for entry in stages if entry[0] in kinds)
+def _of_kind(kind: str) -> Callable[[Stages], Stages]:
+    return lambda stages: tuple(entry for entry in stages if entry[0] == kind)
 
 
 def _unchanged(prior: Avatar, tensors: Tensors, seed: int) -> Tensors:
@@ -118,9 +118,9 @@ METHODS = (
     Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
-    Method("b.3", "with refinement: the shipped fit", _of_kind(APPEARANCE, RELIEF), _unchanged, after="a.4"),
+    Method("b.3", "with refinement: the shipped fit", _of_kind(APPEARANCE), _unchanged, after="a.4"),
     Method("b.4", "with a relief stage", _with_relief, _unchanged, after="a.4"),
     Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
-    Method("b.6", "as b.3, without shadows", _of_kind(APPEARANCE, RELIEF), _unchanged, after="a.4", shadows=False),
+    Method("b.6", "as b.3, without shadows", _of_kind(APPEARANCE), _unchanged, after="a.4", shadows=False),
 )
 BY_NAME = {method.name: method for method in METHODS}
