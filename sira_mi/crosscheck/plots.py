@@ -101,6 +101,7 @@ def plot_fits(points: Sequence[FitPoint], path: Path) -> None:
         for p in points:
             axis.annotate(p.label, (p.seconds, getattr(p, name)), textcoords="offset points", xytext=(4, 4))
         axis.set(xlabel="wall time of a fit, s", ylabel=label, xlim=(0, 1.3 * max(p.seconds for p in points)))
+        axis.margins(y=0.2)
     axes[0].set_ylim(0, 1.2 * max(p.millimetres for p in points))
     figure.tight_layout()
     _save(figure, path)

@@ -299,7 +299,7 @@ without a row was left out by `--methods`.
 _TRIED_TEXT = """## What was tried against what is missed
 
 On six other heads of the test split unless said: few, so that figures show a direction rather than a size. None of this
-is in the shipped fit. What the same six heads brought into it: a photo's exposure taken out before it is compared with the
+is in the shipped fit. What the six heads brought into it: a photo's exposure taken out before it is compared with the
 learned radiance (face 1.36 → 1.34 mm, camera's frame 2.49 → 2.26, hidden half 6.9 → 6.3, normals 10.0° → 9.5°), dark
 skin put down to dark light (diffuse albedo before the refinement 19.4 → 22.7 dB, scaled 23.6 → 25.3).
 
