@@ -1,17 +1,17 @@
-"""The measures of the portrait benchmark: distances against brute force and analytic values, alignments that recover
-known maps, regions that leave out what they must, images with known errors, and truth files whose defects are named."""
+"""Scores of heads: distances against brute force and analytic values, alignments that recover known maps, regions that
+leave out what they must."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 import trimesh
+from egg import HAIR, SIZE, SKIN, head_like, landmarks_on, truth_of, turned_camera
 from scipy.spatial.transform import Rotation
 
 from sira_mi.collection.annotation import Similarity
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits.alignment import SIX_LANDMARKS, Icp, distances_from, icp, inverse
-from sira_mi.evaluate.portraits.appearance_scores import PredictedAppearance, score_appearance
+from sira_mi.evaluate.portraits.alignment import Icp, distances_from, icp, inverse
 from sira_mi.evaluate.portraits.geometry_scores import (
     GeometrySettings,
     PredictedHead,
@@ -21,67 +21,10 @@ from sira_mi.evaluate.portraits.geometry_scores import (
     true_surface,
 )
 from sira_mi.evaluate.portraits.surface_distance import TriangleTree, nearest_reference
-from sira_mi.evaluate.portraits.truth import Truth, load_truth
+from sira_mi.evaluate.portraits.truth import Truth
 from sira_mi.evaluate.portraits.visible_surface import even_samples, mesh_images, outer_surface
-from sira_mi.portrait.camera import Camera
 
 QUICK = GeometrySettings(samples=4000, icp_points=1500)
-SKIN, HAIR, CLOTH, NOTHING = 0, 1, 3, 255
-SIZE = 64
-
-
-def head_like(radius=1.0, level: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """An egg with a nose at +z and no symmetry, `radius` scene units (or a function of unit directions)."""
-    ball = trimesh.creation.icosphere(subdivisions=level)
-    way = ball.vertices
-    shape = 1 + 0.12 * way[:, 1] + 0.05 * way[:, 0] * way[:, 2] - 0.1 * way[:, 0] ** 2
-    shape += 0.2 * np.exp(-((way - [0, -0.1, 0.995]) ** 2).sum(1) / 0.03)
-    size = radius(way) if callable(radius) else radius
-    return way * (shape * size)[:, None], np.asarray(ball.faces)
-
-
-def landmarks_on(vertices: np.ndarray) -> np.ndarray:
-    """The six landmarks where a face would have them, on the front of a mesh, NaN elsewhere."""
-    places = [(-0.2, 0.2), (0.2, 0.2), (0.0, -0.1), (0.0, -0.2), (-0.25, -0.45), (0.25, -0.45)]
-    result = np.full((468, 3), np.nan)
-    way = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    for landmark, (x, y) in zip(SIX_LANDMARKS, places, strict=True):
-        result[landmark] = vertices[np.argmax(way @ np.array([x, y, np.sqrt(1 - x * x - y * y)]))]
-    return result
-
-
-def turned_camera(yaw: float = 25.0, distance: float = 8.0) -> Camera:
-    """A camera looking at the origin, turned about the vertical."""
-    rotation = np.diag([1.0, -1, -1]) @ Rotation.from_euler("y", -yaw, degrees=True).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3], pose[2, 3] = rotation, distance
-    focal = 0.4 * SIZE * distance
-    return Camera(np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]), pose, SIZE, SIZE)
-
-
-def truth_of(vertices, faces, face_region=None, landmarks=None, camera=None) -> Truth:
-    """A truth whose images but normals and masks are made up."""
-    camera = camera or turned_camera()
-    images = mesh_images(vertices, faces, camera)
-    rng = np.random.default_rng(3)
-    inside = images.mask[..., None]
-    albedo = np.where(inside, rng.uniform(0.2, 0.6, (SIZE, SIZE, 3)), 0).astype(np.float32)
-    shading = np.where(images.mask, rng.uniform(0.3, 1.2, (SIZE, SIZE)), 0).astype(np.float32)
-    return Truth(
-        camera=camera,
-        image=albedo * shading[..., None],
-        mask=images.mask.astype(np.float32),
-        region=np.where(images.mask, SKIN, NOTHING).astype(np.uint8),
-        diffuse_albedo=albedo,
-        specular_albedo=np.where(images.mask, rng.uniform(0.02, 0.05, images.mask.shape), 0).astype(np.float32),
-        normal=images.normal.astype(np.float32),
-        shading=shading,
-        shadow=np.where(images.mask, rng.uniform(0, 1, images.mask.shape), 0).astype(np.float32),
-        vertices=vertices,
-        faces=faces,
-        face_region=np.zeros(len(faces), np.uint8) if face_region is None else face_region,
-        landmarks=landmarks_on(vertices) if landmarks is None else landmarks,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -380,158 +323,3 @@ def test_silhouettes_overlap_by_their_pixels():
 def test_a_prediction_that_cannot_be_measured_is_refused(truth, surface, changes, message):
     with pytest.raises(InputError, match=message):
         score_geometry(copy_of(truth, **changes), truth, surface, QUICK)
-
-
-# The truth's file
-
-
-def write(path, truth: Truth, **changes):
-    arrays = {field.name: getattr(truth, field.name) for field in dataclasses.fields(truth) if field.name != "camera"}
-    arrays |= {"K": truth.camera.K, "world_to_camera": truth.camera.world_to_camera}
-    arrays["landmarks_valid"] = np.isfinite(truth.landmarks).all(axis=1)
-    arrays["landmarks"] = np.nan_to_num(truth.landmarks).astype(np.float32)
-    arrays["faces"] = truth.faces.astype(np.int32)
-    arrays |= changes
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-    return path
-
-
-def test_a_truth_is_read_as_it_was_written(truth, tmp_path):
-    read = load_truth(write(tmp_path / "truth.npz", truth))
-    for field in dataclasses.fields(truth):
-        if field.name != "camera":
-            np.testing.assert_allclose(getattr(read, field.name), getattr(truth, field.name), rtol=1e-6)
-    np.testing.assert_array_equal(read.camera.world_to_camera, truth.camera.world_to_camera)
-    assert (read.camera.width, read.camera.height) == (SIZE, SIZE)
-    assert np.isnan(read.landmarks).any(axis=1).sum() == 462
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"shadow": None}, "shadow"),
-        ({"shading": np.zeros((3, 3))}, r"shading must be numbers \[64, 64\]"),
-        ({"mask": np.zeros(4)}, "mask must be an image"),
-        ({"mask": np.full((SIZE, SIZE), 2.0)}, "mask must be within 0 and 1"),
-        ({"image": np.full((SIZE, SIZE, 3), np.inf)}, "image contains NaN or infinity"),
-        ({"faces": np.array([[0, 1, -1]]), "face_region": np.zeros(1, np.uint8)}, "do not exist"),
-        ({"face_region": np.zeros(7, np.uint8)}, "face_region must be numbers"),
-        ({"world_to_camera": 2 * np.eye(4)}, "last row of world_to_camera"),
-        ({"landmarks": np.full((468, 3), np.nan)}, "a valid landmark is not finite"),
-    ],
-)
-def test_a_broken_truth_is_named(truth, tmp_path, changes, message):
-    with pytest.raises(InputError, match=message):
-        load_truth(write(tmp_path / "truth.npz", truth, **changes))
-
-
-def test_a_file_that_is_no_truth_is_refused(tmp_path):
-    (tmp_path / "truth.npz").write_bytes(b"no archive")
-    for path in (tmp_path / "truth.npz", tmp_path / "missing.npz"):
-        with pytest.raises(InputError, match="not the truth of a portrait"):
-            load_truth(path)
-
-
-# Appearance
-
-
-def appearance_of(truth: Truth, **changes) -> PredictedAppearance:
-    whole = {"final": truth.image, "mask": truth.mask}
-    whole |= {name: getattr(truth, name) for name in ("diffuse_albedo", "specular_albedo")}
-    return PredictedAppearance(**(whole | changes))
-
-
-def test_the_truth_itself_has_no_error(truth):
-    scores = score_appearance(appearance_of(truth), truth)
-    for name in ("final", "diffuse", "diffuse_scaled", "specular", "specular_scaled"):
-        assert scores[f"{name}_psnr"] > 100 and scores[f"{name}_ssim"] == pytest.approx(1, abs=1e-6)
-    assert scores["skin_ciede2000_mean"] < 1e-3 and scores["leakage_shading"] == scores["leakage_shadow"] == 0
-    inner = sum(truth.mask[1 + i : SIZE - 1 + i, 1 + j : SIZE - 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)) > 8.5
-    assert scores["pixels"] == scores["skin_pixels"] == inner.sum()
-    assert scores["lost_pixels"] == 0 and scores["final_nonfinite"] == 0
-
-
-@pytest.mark.filterwarnings("ignore:.*Matplotlib")
-def test_errors_of_known_size_have_their_psnr(truth):
-    """sRGB values 0.5 and 0.6 are 20 dB apart, as specular strengths too; outside the mask nothing counts. CIEDE2000 is
-    that of another implementation."""
-    import colour
-
-    def linear(value):
-        return ((value + 0.055) / 1.055) ** 2.4
-
-    grey = {name: np.full((SIZE, SIZE, 3), linear(0.5), np.float32) for name in ("image", "diffuse_albedo")}
-    flat = dataclasses.replace(truth, **grey, specular_albedo=np.full((SIZE, SIZE), 0.08 * linear(0.5)))
-    lighter = np.where(truth.mask[..., None] > 0, linear(0.6), [7.0, 7, 7])
-    scores = score_appearance(
-        appearance_of(flat, final=lighter, diffuse_albedo=lighter, specular_albedo=0.08 * lighter[..., 0]), flat
-    )
-    for name in ("final", "diffuse", "specular"):
-        assert scores[f"{name}_psnr"] == pytest.approx(20, abs=1e-3) and scores[f"{name}_ssim"] < 1
-    assert scores["diffuse_scaled_psnr"] > 100 and scores["specular_scaled_ssim"] == pytest.approx(1, abs=1e-6)
-    lab = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ([v] * 3)) for v in (0.6, 0.5)]
-    expected = colour.delta_E(*lab, method="CIE 2000")
-    assert scores["skin_ciede2000_mean"] == pytest.approx(expected, abs=0.02)
-    assert scores["skin_ciede2000_median"] == pytest.approx(expected, abs=0.02)
-    assert scores["skin_scaled_ciede2000_mean"] < 1e-3
-
-
-def test_structure_is_seen_by_ssim(truth):
-    """Pixels in another order have the same histogram and no similar structure."""
-    inside = truth.mask > 0
-    shuffled = truth.image.copy()
-    shuffled[inside] = np.random.default_rng(0).permutation(truth.image[inside])
-    scores = score_appearance(appearance_of(truth, final=shuffled), truth)
-    assert scores["final_ssim"] < 0.3
-
-
-def test_leakage_is_one_of_baked_light_and_none_of_other_errors(truth):
-    """An albedo that took over half of the log shading, one that took shadows, and one with an error of its own."""
-    half = truth.diffuse_albedo * np.sqrt(np.maximum(truth.shading, 1e-6))[..., None]
-    scores = score_appearance(appearance_of(truth, diffuse_albedo=half), truth)
-    assert scores["leakage_shading"] == pytest.approx(1, abs=1e-5)
-    assert scores["leakage_slope"] == pytest.approx(0.5, abs=1e-4)
-    brighter = score_appearance(appearance_of(truth, diffuse_albedo=truth.diffuse_albedo**2 / (half + 1e-9)), truth)
-    assert brighter["leakage_shading_signed"] == pytest.approx(-1, abs=1e-5) and brighter["leakage_shading"] > 0.99
-    dark = truth.diffuse_albedo * np.exp(0.5 * truth.shadow)[..., None]
-    cast = score_appearance(appearance_of(truth, diffuse_albedo=dark), truth)
-    assert cast["leakage_shadow"] == pytest.approx(1, abs=1e-5) and cast["leakage_shading"] < 0.1
-    noise = np.exp(0.3 * np.random.default_rng(1).standard_normal((SIZE, SIZE, 1)))
-    other = score_appearance(appearance_of(truth, diffuse_albedo=truth.diffuse_albedo * noise), truth)
-    assert other["leakage_shading"] < 0.1 and other["leakage_shadow"] < 0.1
-
-
-def test_values_that_are_no_numbers_are_counted_and_cost(truth):
-    """NaN counts as black: it lowers the score."""
-    row, column = SIZE // 2, SIZE // 2
-    broken = truth.image.copy()
-    broken[row, column, :2] = np.nan, np.inf
-    scores = score_appearance(appearance_of(truth, final=broken), truth)
-    assert scores["final_nonfinite"] == 2 and scores["diffuse_nonfinite"] == 0
-    assert np.isfinite(scores["final_psnr"]) and scores["final_psnr"] < 60
-
-
-def test_pixels_that_the_prediction_lacks_are_counted(truth):
-    mask = truth.mask.copy()
-    mask[: SIZE // 2] = 0
-    scores = score_appearance(appearance_of(truth, mask=mask), truth)
-    assert scores["lost_pixels"] == truth.mask[: SIZE // 2].sum()
-    assert 0 < scores["pixels"] < 0.6 * truth.mask.sum()
-    nothing = score_appearance(appearance_of(truth, mask=0 * mask), truth)
-    assert nothing["pixels"] == 0 and np.isnan([nothing["final_psnr"], nothing["final_ssim"]]).all()
-    assert np.isnan([nothing["leakage_shading"], nothing["leakage_slope"], nothing["skin_ciede2000_mean"]]).all()
-
-
-def test_hair_and_cloth_are_not_skin(truth):
-    region = truth.region.copy()
-    region[:, : SIZE // 2][truth.mask[:, : SIZE // 2] > 0] = CLOTH
-    other = truth.diffuse_albedo.copy()
-    other[:, : SIZE // 2] *= 0.2
-    scores = score_appearance(appearance_of(truth, diffuse_albedo=other), dataclasses.replace(truth, region=region))
-    assert scores["skin_ciede2000_mean"] < 1e-3 and scores["diffuse_psnr"] < 30
-    assert scores["skin_pixels"] < 0.6 * scores["pixels"]
-
-
-def test_images_of_another_size_are_refused(truth):
-    with pytest.raises(InputError, match="specular_albedo must be numbers"):
-        score_appearance(appearance_of(truth, specular_albedo=truth.image), truth)
