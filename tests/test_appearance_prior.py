@@ -143,10 +143,9 @@ def skin_loss(albedo: np.ndarray, weight: np.ndarray, radiance: float = SETTINGS
     """Of scenes whose landmarks all have the same albedo [S, 3], with landmark weights [S, L]."""
     columns = np.repeat(albedo.T[:, :, None], weight.shape[1], axis=2).reshape(3, -1).astype(np.float32)
     weight = mi.TensorXf(weight.reshape(1, -1).astype(np.float32))
-    level = np.full(len(albedo), radiance)
-    loss = skin_tone.skin_tone_loss(
-        mi.TensorXf(columns), weight, level, SETTINGS.skin_radiance, SETTINGS.skin_deviations
-    )
+    level = np.full(len(albedo), skin_tone.SKIN_LUMINANCE * radiance / SETTINGS.skin_radiance)
+    expected = skin_tone.tone_of_luminance(level)
+    loss = skin_tone.skin_tone_loss(mi.TensorXf(columns), weight, expected, SETTINGS.skin_deviations)
     return float(loss.numpy().item())
 
 

@@ -24,7 +24,7 @@ from sira_mi.evaluate.portraits.benchmark_plan import (
     BenchmarkSettings,
     Identity,
     choose_identities,
-    held_out_heads,
+    heads_of,
     named_sources,
     plan,
 )
@@ -388,7 +388,7 @@ def test_portraits_that_are_there_are_kept(built, collection, monkeypatch):
     benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
     assert taken == [entries[1]["name"]] and photo.read_bytes() == before
     finer = replace(settings.photo, samples=16)
-    head = plan(choose_identities(held_out_heads(collection)[:1], 1, 0), [], settings)[0]
+    head = plan(choose_identities(heads_of(collection, "test")[:1], 1, 0), [], settings)[0]
     assert all(benchmark.finished_entry(folder / shot.name, shot.key(settings.photo)) for shot in head)
     assert not any(benchmark.finished_entry(folder / shot.name, shot.key(finer)) for shot in head)
 
@@ -397,11 +397,15 @@ def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
     """Sources without data, unknown sources, a head that the data do not give again, no maps, damaged files."""
     none = dict.fromkeys(("hair", "ict", "valid", "meshes"))
     with pytest.raises(InputError, match="give its data by --valid"):
-        named_sources(collection, None, none)
+        named_sources(collection, "test", None, none)
     with pytest.raises(InputError, match="no test heads of ict"):
-        named_sources(collection, ["ict"], none)
-    assert [source.name for source in named_sources(collection, ["makehuman"], none)] == ["makehuman"]
-    head = held_out_heads(collection)[0]
+        named_sources(collection, "test", ["ict"], none)
+    assert [source.name for source in named_sources(collection, "test", ["makehuman"], none)] == ["makehuman"]
+    assert heads_of(collection, "train") == []
+    with pytest.raises(InputError, match="no train heads of makehuman"):
+        settings = BenchmarkSettings(split="train")
+        benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), None, 1, settings)
+    head = heads_of(collection, "test")[0]
     with pytest.raises(InputError, match="is not the collection's"):
         benchmark.rebuilt(MakeHumanSource(8, None), replace(head, person={"other": 1}))
     with pytest.raises(InputError, match=r"no \.exr"):

@@ -7,26 +7,31 @@ import numpy as np
 import pytest
 from conftest import camera
 
+from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.fit import initial_tensors
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.models.af_sm import AppearanceTraining
 from sira_mi.models.avatar import PRIOR, load_avatar
-from sira_mi.models.skin_tone import SKIN_LANDMARKS
 from sira_mi.portrait.portrait import Portrait
 
-SIZE = 64
+SIZE = 128
+EYES = (33, 246, 161, 160, 159, 158, 157, 173, 133, 155, 154, 153, 145, 144, 163, 7)  # around the right one
+LEFT_EYE = (263, 466, 388, 387, 386, 385, 384, 398, 362, 382, 381, 380, 374, 373, 390, 249)
 USUAL = AppearanceTraining().skin_radiance
 
 
 @pytest.fixture(scope="module")
 def portrait():
-    """The mean head's landmarks before a camera; grey skin of usual brightness, a darker rest, all foreground."""
-    view = camera(focal=100, size=SIZE)
+    """The mean head's landmarks before a camera; a grey face of usual brightness, one eye twice as bright, the rest
+    darker, all foreground."""
+    view = camera(focal=200, size=SIZE)
     points = load_avatar(PRIOR).tensors["landmarks"] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
     landmarks = (points @ view.K.T)[:, :2] / points[:, 2:]
     image = np.full((SIZE, SIZE, 3), 0.02, np.float32)
-    for column, row in landmarks[list(SKIN_LANDMARKS)]:
-        image[int(row) - 2 : int(row) + 3, int(column) - 2 : int(column) + 3] = USUAL
+    left, top, right, bottom = (int(v) for v in (*np.nanmin(landmarks, axis=0), *np.nanmax(landmarks, axis=0)))
+    image[top : bottom + 1, left : right + 1] = USUAL
+    for column, row in landmarks[list(EYES)]:
+        image[int(row) - 1 : int(row) + 2, int(column) - 1 : int(column) + 2] = 2 * USUAL
     return Portrait(image, np.ones((SIZE, SIZE), np.float32), landmarks, view, ())
 
 
@@ -36,38 +41,61 @@ def darker(portrait: Portrait, factor: float) -> Portrait:
 
 def test_exposure_brings_the_skin_to_that_of_the_training(variant, portrait):
     """Whatever the rest of the photo; bounded, and 1 where no skin is seen."""
-    from sira_mi.fit.skin import face_exposure, skin_radiance
+    from sira_mi.fit.skin import face_exposure, skin_cues
 
-    assert skin_radiance(portrait) == pytest.approx(USUAL, rel=1e-5)
+    assert skin_cues(portrait).radiance == pytest.approx(USUAL, rel=1e-5)
     assert face_exposure(darker(portrait, 4)) == pytest.approx(4, rel=1e-5)
     assert face_exposure(darker(portrait, 0.8)) == pytest.approx(0.8, rel=1e-5)
     assert face_exposure(darker(portrait, 1e4)) == 16 and face_exposure(darker(portrait, 0.1)) == 0.5
+    for blind in blind_portraits(portrait):
+        assert skin_cues(blind) is None and face_exposure(blind) == 1
+
+
+def blind_portraits(portrait: Portrait) -> tuple[Portrait, Portrait]:
+    """Without landmarks, and without a person at them."""
     nowhere = dataclasses.replace(portrait, landmarks=np.full((468, 2), np.nan))
-    behind = dataclasses.replace(portrait, mask=np.zeros_like(portrait.mask))
-    for blind in (nowhere, behind):
-        assert skin_radiance(blind) is None and face_exposure(blind) == 1
+    return nowhere, dataclasses.replace(portrait, mask=np.zeros_like(portrait.mask))
 
 
-def test_a_share_of_the_darkness_is_put_down_to_the_skin(variant, portrait):
-    """Of dark skin: with share 1 skin as dark as in the photo is expected, with 0 that of usual photos. Skin that is
-    brighter than usual is lighter skin."""
-    from sira_mi.fit.shaded import photo_points
-    from sira_mi.fit.skin import skin_patches
+def test_the_white_of_the_eyes_tells_light_from_skin(variant, portrait):
+    """The ratio of skin to eyes does not depend on the exposure; where eyes are as bright, skin is light. An eye that
+    is not seen does not count; without any, brightness alone tells. Dark glasses do not make skin white."""
+    from sira_mi.fit.skin import SkinCues, skin_cues, skin_luminance
+
+    landmarks = portrait.landmarks.copy()
+    landmarks[list(LEFT_EYE)] = np.nan
+    one = dataclasses.replace(portrait, landmarks=landmarks)
+    assert skin_cues(one).over_white == pytest.approx(-np.log(2), abs=1e-5)
+    assert skin_cues(darker(one, 4)).over_white == pytest.approx(-np.log(2), abs=1e-5)
+    eyeless = portrait.landmarks.copy()
+    eyeless[[*EYES, *LEFT_EYE]] = np.nan
+    blind = skin_cues(dataclasses.replace(portrait, landmarks=eyeless))
+    assert blind.over_white is None and blind.radiance == pytest.approx(USUAL, rel=1e-5)
+    levels = [skin_luminance(SkinCues(0.2, contrast)) for contrast in (-1.5, -0.7, 0.0)]
+    assert 0.07 < levels[0] < levels[1] < levels[2] < 0.45
+    assert levels[0] < skin_luminance(SkinCues(0.2, None)) < levels[2]
+    sunglasses = dataclasses.replace(one, image=np.where(one.image > USUAL * 1.01, 0, one.image))
+    assert skin_luminance(skin_cues(sunglasses)) < 0.8
+
+
+def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
+    """The loss is lowest where the albedo at the landmarks has the expected luminance."""
+    from sira_mi.fit.shaded import base_albedo, photo_points
+    from sira_mi.fit.skin import skin_cues, skin_luminance, skin_patches
 
     prior = load_avatar(PRIOR)
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(PRIOR), "voxel": 0.1})
     points = photo_points(portrait, head, shadows=False)
     floats = {name: mi.Float(value) for name, value in prior.tensors.items() if value.ndim == 1}
-
-    def loss(photo: Portrait, share: float) -> float:
-        return skin_patches(photo, points).loss(prior, floats, share).numpy().item()
-
-    dark = darker(portrait, 8)
-    assert len(skin_patches(portrait, points).points.row) > 6
-    assert loss(dark, 0.0) == pytest.approx(loss(portrait, 1.0), rel=1e-5)
-    assert loss(dark, 0.0) < loss(dark, 0.3) < loss(dark, 1.0)
-    bright = darker(portrait, 0.5)
-    assert loss(bright, 0.0) == loss(bright, 1.0) != loss(portrait, 1.0)
+    patches = skin_patches(portrait, points)
+    assert len(patches.points.row) > 6
+    assert patches.luminance == skin_luminance(skin_cues(portrait))
+    shown = float((base_albedo(prior, floats, patches.points).numpy().mean(axis=1) @ np.array(LUMINANCE)).item())
+    levels = np.array([0.3, 0.6, 1.0, 1.6, 3.0])
+    losses = [
+        dataclasses.replace(patches, luminance=shown * level).loss(prior, floats).numpy().item() for level in levels
+    ]
+    assert np.argmin(losses) == 2 and np.all(np.diff(losses[:3]) < 0) and np.all(np.diff(losses[2:]) > 0)
     off = dataclasses.replace(portrait, landmarks=portrait.landmarks + 1000)
     assert skin_patches(off, points) is None
 

@@ -1,14 +1,18 @@
-"""`python -m sira_mi.evaluate prior|sizes|benchmark --collection DIR …`: measures the priors, builds the benchmark.
+"""`python -m sira_mi.evaluate prior|sizes|benchmark|skin|fits …`: measures the priors, builds the benchmark, fits it.
 
 `prior` measures the prior of a run on the collection's test split, trains and measures the ablations, and writes
 `docs/priors.md` and its pictures; `sizes` trains and measures networks of several sizes for a table on that page.
 Results are kept in RUNS/evidence, so that only what has changed is measured again. `benchmark` photographs test heads
-of the collection under known light; portraits that are there already are kept.
+of the collection under known light; portraits that are there already are kept. `skin` measures on such portraits, of
+training heads, what brightness of skin and eyes tell of the skin's albedo: the constants of `sira_mi.fit.skin`. `fits`
+fits and scores the benchmark's portraits and writes `docs/results.md`.
 """
 
 import argparse
 import time
 from pathlib import Path
+
+import numpy as np
 
 from sira_mi.errors import CommandParser, InputError, run_command
 
@@ -34,7 +38,16 @@ def main() -> None:
     portraits.add_argument("--hdri", type=Path, help="folder of .exr maps for the outdoor lights; else sun and sky")
     portraits.add_argument("--sources", nargs="+", metavar="NAME", help="use these sources only, of the collection's")
     portraits.add_argument("--primary", action="store_true", help="one light of each head instead of three")
+    portraits.add_argument(
+        "--split", choices=("test", "train"), default="test", help="train: for `skin`, not for scores"
+    )
+    portraits.add_argument("--heads", type=int, default=12, metavar="N", help="how many heads (default: 12)")
+    portraits.add_argument("--size", type=int, default=512, metavar="N", help="of a photo, pixels (default: 512)")
+    portraits.add_argument("--samples", type=int, default=256, metavar="N", help="paths a pixel, a power of 4")
     portraits.add_argument("--workers", type=int, default=1, help="processes")
+    skin = commands.add_parser("skin", help="measure what photos tell of the level of their skin's albedo")
+    skin.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
+    skin.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     fits = commands.add_parser("fits", help="fit the benchmark's portraits, score them, write the page")
     fits.add_argument("--benchmark", type=Path, required=True)
     fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
@@ -54,6 +67,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.command == "benchmark":
         return make_benchmark(arguments)
+    if arguments.command == "skin":
+        return measure_skin(arguments)
     if arguments.command == "fits":
         return compare_fits(arguments)
     if arguments.steps < 0:
@@ -116,17 +131,44 @@ def compare_fits(arguments: argparse.Namespace) -> None:
     print(f"{write_results(shipped, ablations, described, arguments.out)} written")
 
 
+def measure_skin(arguments: argparse.Namespace) -> None:
+    """Prints what the cues of `sira_mi.fit.skin` tell of the skin's albedo, over a benchmark's portraits."""
+    import mitsuba as mi
+
+    mi.set_variant(arguments.variant)
+    from sira_mi.evaluate.portraits.skin_level import estimate, observe
+
+    observations, blind = observe(arguments.benchmark)
+    spread = np.std(np.log([o.luminance for o in observations]))
+    print(f"{len(observations)} portraits, log of the skin's luminance within {spread:.2f}; unseen: {len(blind)}")
+    for title, eyes in (("by skin", False), ("by skin and eyes", True)):
+        found = estimate(observations, eyes)
+        values = ", ".join(f"{value:.2f}" for value in found.coefficients)
+        print(f"{title}: {values}; error {found.error:.2f}")
+
+
 def make_benchmark(arguments: argparse.Namespace) -> None:
     """Builds the benchmark that the command line describes and prints what it holds."""
     from sira_mi.evaluate.portraits.benchmark import build_benchmark
     from sira_mi.evaluate.portraits.benchmark_plan import BenchmarkSettings, named_sources
+    from sira_mi.evaluate.portraits.benchmark_portraits import PhotoSettings
 
-    if arguments.workers < 1:
-        raise InputError("--workers must be at least 1")
+    for name in ("workers", "heads"):
+        if getattr(arguments, name) < 1:
+            raise InputError(f"--{name} must be at least 1")
+    if not 64 <= arguments.size <= 4096:
+        raise InputError("--size must be 64 to 4096 pixels")
+    if arguments.samples not in (1, 4, 16, 64, 256, 1024):
+        raise InputError("--samples must be a power of 4 up to 1024")
     data = {name: getattr(arguments, name) for name in ("hair", "ict", "valid", "meshes")}
-    sources = named_sources(arguments.collection, arguments.sources, data)
+    sources = named_sources(arguments.collection, arguments.split, arguments.sources, data)
     start = time.monotonic()
-    settings = BenchmarkSettings(primary_only=arguments.primary)
+    settings = BenchmarkSettings(
+        identities=arguments.heads,
+        split=arguments.split,
+        primary_only=arguments.primary,
+        photo=PhotoSettings(size=arguments.size, samples=arguments.samples),
+    )
     entries = build_benchmark(arguments.collection, arguments.out, sources, arguments.hdri, arguments.workers, settings)
     heads = len({entry["identity"] for entry in entries})
     hair = len({entry["identity"] for entry in entries if entry["hair"]})

@@ -75,9 +75,7 @@ class AppearanceProblem:
         return mi.TensorXf(np.ascontiguousarray(base[:, index])), skin
 
     def _skin_loss(self, current: dict):
-        if self.skin is None:
-            return None
-        return self.skin.loss(self.avatar, current, self.settings.appearance.dark_skin)
+        return None if self.skin is None else self.skin.loss(self.avatar, current)
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         weights, a = self.settings.appearance, self.avatar.architecture

@@ -39,11 +39,7 @@ class AppearanceWeights:
     refinement: float = 0.1  # eq. 12
     embedding: float = 1e-5  # on ‖z‖²
     white_light: float = 0.005  # mean squared log-chroma of the lobes: the prior on the light's colour
-    skin_tone: float = 2e-3  # on the deviation of the skin's albedo from measured skin, in standard deviations
-    # Part of the log luminance by which skin is darker in the photo than in usual ones that is put down to the skin
-    # rather than to the light: by the variances where log skin varies by 0.5 and the log light on a face by 0.8. Photos
-    # are not exposed for more than their brightest parts, so that skin that is brighter is lighter skin.
-    dark_skin: float = 0.3
+    skin_tone: float = 2e-2  # on the deviation of the skin's albedo from the expected tone, in standard deviations
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
 
 
@@ -85,9 +81,10 @@ class FitSettings:
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
-def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]:
-    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the two scales. Geometry that is fitted for
-    longer follows the photo further from the prior, on some heads away from the person."""
+def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tuple[str, Stage], ...]:
+    """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the scales of the geometry stages, of light,
+    albedo and speculars, and of the refinement. Geometry that is fitted for longer follows the photo further from the
+    prior, on some heads away from the person."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)
@@ -130,7 +127,7 @@ def _stages(geometry: float, appearance: float) -> tuple[tuple[str, Stage], ...]
             APPEARANCE,
             Stage(
                 "refinement",
-                steps(800),
+                round(800 * refinement),
                 {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3},
                 k_s=(1.0, 1.0),
                 k_r=1.0,
@@ -169,7 +166,7 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 
 QUALITIES = {
-    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5)),
+    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.7, 0.35)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0, 1.0)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5, 2.5)),
 }

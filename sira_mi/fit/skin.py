@@ -1,5 +1,9 @@
 """The bare facial skin of a photo: it tells how the photo is exposed, and settles the level of the light against the
-albedo's."""
+albedo's.
+
+How light skin is and how bright the light on it, a photo tells by two cues: how bright the skin is in it (photos are
+exposed for the light in part only), and how bright it is against the white of the eyes, which differs little between
+people and is lit like the skin below it."""
 
 from __future__ import annotations
 
@@ -8,12 +12,14 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
+from skimage.draw import polygon2mask
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.shaded import SeenPoints, base_albedo
 from sira_mi.models.af_sm import AppearanceTraining
 from sira_mi.models.avatar import Avatar
-from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss
+from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss, tone_of_luminance
+from sira_mi.portrait.landmarks import BELOW_EYES, EYES
 from sira_mi.portrait.portrait import Portrait
 
 # Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
@@ -22,63 +28,107 @@ _REACH = 0.04
 _DARKEST = 1e-3
 # Photos are scaled by no less and no more than this for the learned radiance.
 _EXPOSURES = (0.5, 16.0)
+# The white of an eye is as bright as the brightest tenth of its opening, percent.
+_WHITE = 90
+# Log luminance of skin's albedo by the photo's cues, of `python -m sira_mi.evaluate skin` on portraits of training
+# heads: a constant, what it rises with the log radiance of the skin and with the log of that over the eyes' white.
+_BY_SKIN = (-1.12, 0.23)
+_BY_SKIN_AND_EYES = (-1.05, 0.14, 0.57)
+# The log of skin over the eyes' white lies in this range; what is seen beyond is no open eye in the skin's light.
+_OVER_WHITE = (-3.0, 1.0)
 
 
-def skin_landmarks(portrait: Portrait) -> tuple[np.ndarray, float]:
-    """Pixels [L, 2] of the landmarks of bare facial skin that a photo has, and how near to them its skin is sure."""
-    landmarks = portrait.landmarks[list(SKIN_LANDMARKS)]
-    known = portrait.landmarks[np.isfinite(portrait.landmarks[:, 1]), 1]
-    reach = _REACH * float(np.ptp(known)) if len(known) else 0.0
-    return landmarks[np.isfinite(landmarks).all(axis=1)], reach
+@dataclass(frozen=True)
+class SkinCues:
+    """What a photo tells of its skin."""
+
+    radiance: float  # luminance of the skin, geometric mean
+    over_white: float | None  # log of its luminance below the eyes over the white of the eyes; None where none is seen
 
 
-def skin_radiance(portrait: Portrait) -> float | None:
-    """Luminance of the bare facial skin in a photo, geometric mean; None where none is seen."""
-    landmarks, reach = skin_landmarks(portrait)
-    row, column = np.nonzero(portrait.mask > 0.5)
-    if not len(landmarks) or not len(row):
-        return None
-    found = cKDTree(np.stack([column, row], axis=1) + 0.5).query_ball_point(landmarks, reach)
+def skin_cues(portrait: Portrait) -> SkinCues | None:
+    """What a photo tells of its skin; None where no skin is seen."""
+    luminance = _luminance_near(portrait, SKIN_LANDMARKS)
+    return SkinCues(float(np.exp(np.log(luminance).mean())), _over_white(portrait)) if len(luminance) else None
+
+
+def near_landmarks(landmarks: np.ndarray, chosen: tuple[int, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels of a `mask` [H, W] that are near to the `chosen` ones of landmarks [468, 2], in
+    pixels, NaN where unknown."""
+    row, column = np.nonzero(mask)
+    wanted = landmarks[list(chosen)]
+    wanted = wanted[np.isfinite(wanted).all(axis=1)]
+    if not len(wanted) or not len(row):
+        return row[:0], column[:0]
+    found = cKDTree(np.stack([column, row], axis=1) + 0.5).query_ball_point(wanted, reach(landmarks))
     near = np.unique(np.concatenate(found).astype(int))
-    if not len(near):
-        return None
-    luminance = portrait.image[row[near], column[near]] @ np.array(LUMINANCE)
-    return float(np.exp(np.log(np.maximum(luminance, _DARKEST)).mean()))
+    return row[near], column[near]
+
+
+def reach(landmarks: np.ndarray) -> float:
+    """How near to a landmark of [468, 2] the skin is sure to be as it is there, pixels."""
+    known = landmarks[np.isfinite(landmarks[:, 1]), 1]
+    return _REACH * float(np.ptp(known)) if len(known) else 0.0
+
+
+def _luminance_near(portrait: Portrait, chosen: tuple[int, ...]) -> np.ndarray:
+    row, column = near_landmarks(portrait.landmarks, chosen, portrait.mask > 0.5)
+    return np.maximum(portrait.image[row, column] @ np.array(LUMINANCE), _DARKEST)
+
+
+def _over_white(portrait: Portrait) -> float | None:
+    """Log of the luminance of the skin below an eye over that of the eye's white, mean of the eyes seen."""
+    contrasts = []
+    for opening, below in zip(EYES, BELOW_EYES, strict=True):
+        outline, skin = portrait.landmarks[list(opening)], _luminance_near(portrait, below)
+        if not np.isfinite(outline).all() or not len(skin):
+            continue
+        inside = polygon2mask(portrait.mask.shape, outline[:, ::-1] - 0.5) & (portrait.mask > 0.5)
+        if inside.any():
+            white = np.percentile(portrait.image[inside] @ np.array(LUMINANCE), _WHITE)
+            contrasts.append(np.log(np.median(skin) / max(white, _DARKEST)))
+    return float(np.clip(np.mean(contrasts), *_OVER_WHITE)) if contrasts else None
 
 
 def face_exposure(portrait: Portrait) -> float:
     """The factor that brings the skin of a photo to the luminance that skin has in the photos of the training; 1 where
     no skin is seen."""
-    radiance = skin_radiance(portrait)
-    return 1.0 if radiance is None else float(np.clip(AppearanceTraining().skin_radiance / radiance, *_EXPOSURES))
+    cues = skin_cues(portrait)
+    return 1.0 if cues is None else float(np.clip(AppearanceTraining().skin_radiance / cues.radiance, *_EXPOSURES))
+
+
+def skin_luminance(cues: SkinCues) -> float:
+    """Luminance of the albedo of skin in a photo with these cues."""
+    if cues.over_white is None:
+        constant, by_radiance = _BY_SKIN
+        return float(np.exp(constant + by_radiance * np.log(cues.radiance)))
+    constant, by_radiance, by_white = _BY_SKIN_AND_EYES
+    return float(np.exp(constant + by_radiance * np.log(cues.radiance) + by_white * cues.over_white))
 
 
 @dataclass(frozen=True)
 class SkinPatches:
-    """Points of bare facial skin, one a landmark, and the luminance of the skin in the photo."""
+    """Points of bare facial skin, one a landmark, and the luminance of the albedo that is expected there."""
 
     points: SeenPoints
-    radiance: float
+    luminance: float
 
-    def loss(self, avatar: Avatar, tensors: dict, share: float):
-        """`skin_tone_loss` of the base diffuse albedo by the decoders at `tensors` (Floats); `share` is the part of the
-        log luminance by which the photo's skin is darker than usual that is put down to the skin, not to the light."""
-        settings, count = AppearanceTraining(), len(self.points.row)
+    def loss(self, avatar: Avatar, tensors: dict):
+        """`skin_tone_loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
+        count = len(self.points.row)
         albedo = base_albedo(avatar, tensors, self.points)
         weight = mi.TensorXf(np.full((1, count), 1 / count, np.float32))
-        usual = settings.skin_radiance
-        expected = np.array([max(self.radiance, usual * (self.radiance / usual) ** share)])
-        return skin_tone_loss(albedo, weight, expected, usual, settings.skin_deviations)
+        expected = tone_of_luminance(np.array([self.luminance]))
+        return skin_tone_loss(albedo, weight, expected, AppearanceTraining().skin_deviations)
 
 
 def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:
     """The points nearest to the photo's landmarks of bare skin; None without a face or where none is seen."""
-    landmarks, reach = skin_landmarks(portrait)
-    radiance = skin_radiance(portrait)
-    if radiance is None or not len(points.row):
+    cues = skin_cues(portrait)
+    if cues is None or not len(points.row):
         return None
+    landmarks = portrait.landmarks[list(SKIN_LANDMARKS)]
     tree = cKDTree(np.stack([points.column, points.row], axis=1) + 0.5)
-    distance, nearest = tree.query(landmarks)
-    if not (distance < reach).any():
-        return None
-    return SkinPatches(points[nearest[distance < reach]], radiance)
+    distance, nearest = tree.query(landmarks[np.isfinite(landmarks).all(axis=1)])
+    close = distance < reach(portrait.landmarks)
+    return SkinPatches(points[nearest[close]], skin_luminance(cues)) if close.any() else None

@@ -18,7 +18,7 @@ from sira_mi.fields.sdf import deform, evaluate_in_chunks, in_three, surface
 from sira_mi.models import losses
 from sira_mi.models.avatar import AvatarArchitecture, signed_distance_field
 from sira_mi.models.scenes import TrainingScene
-from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_radiance, skin_tone_loss
+from sira_mi.models.skin_tone import SKIN_LANDMARKS, SKIN_LUMINANCE, skin_radiance, skin_tone_loss, tone_of_luminance
 from sira_mi.sg.scene_shading import shade_scenes
 from sira_mi.sg.shading import irradiance as irradiance_of
 from sira_mi.sg.shading import shade
@@ -228,10 +228,14 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
         "smoothness": losses.mean(dr.abs(difference)),
         "specular_anchor": losses.mean(anchor * anchor),
         "white_light": losses.mean(grey * grey),
-        "skin_tone": skin_tone_loss(
-            skin, batch.skin_weight, batch.skin_radiance, settings.skin_radiance, settings.skin_deviations
-        ),
+        "skin_tone": skin_tone_loss(skin, batch.skin_weight, expected_skin(settings, batch), settings.skin_deviations),
     }
+
+
+def expected_skin(settings: AppearanceTraining, batch: AppearanceBatch) -> np.ndarray:
+    """Log linear RGB [3, S] of the skin that is expected in each scene. Its photos are taken to be exposed for the
+    light: skin that is brighter in them than usual is lighter by as much."""
+    return tone_of_luminance(SKIN_LUMINANCE * batch.skin_radiance / settings.skin_radiance)
 
 
 def weighted_sum(terms: dict, settings: AppearanceTraining):

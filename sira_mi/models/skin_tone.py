@@ -16,9 +16,10 @@ SKIN_LANDMARKS = (50, 280, 101, 330, 117, 346, 118, 347, 6, 197, 9, 151)
 # across that axis skin varies as within one population (Yun et al. 2010, a* ± 2.65 and b* ± 2.39).
 SKIN_TONE_MEAN = np.array([-1.190, -1.830, -2.175])
 SKIN_TONE_AXIS = np.array([0.524, 0.587, 0.617])
-_SKIN_LUMINANCE = np.array(LUMINANCE) * np.exp(SKIN_TONE_MEAN)
-# Change of log luminance along the axis.
-_SKIN_TONE_SLOPE = float(_SKIN_LUMINANCE @ SKIN_TONE_AXIS / _SKIN_LUMINANCE.sum())
+_AXIS = SKIN_TONE_AXIS / np.linalg.norm(SKIN_TONE_AXIS)
+# Luminance of the mean, and change of its log along the axis.
+SKIN_LUMINANCE = float(np.exp(SKIN_TONE_MEAN) @ np.array(LUMINANCE))
+_SKIN_TONE_SLOPE = float((np.exp(SKIN_TONE_MEAN) * np.array(LUMINANCE)) @ SKIN_TONE_AXIS / SKIN_LUMINANCE)
 # Observations within this distance of a landmark tell how bright the skin is in the photos, scene units.
 _SKIN_RADIUS = 0.06
 # Deviation from measured skin from which on the loss grows linearly, standard deviations.
@@ -36,22 +37,23 @@ def skin_radiance(scene: TrainingScene, landmarks: np.ndarray) -> float:
     return float(np.exp(np.mean(np.log(np.maximum(luminance, 1e-3))))) if len(luminance) else float("nan")
 
 
-def skin_tone_loss(albedo, weight, radiance: np.ndarray, usual_radiance: float, deviations: tuple[float, float]):
-    """Mean over scenes of the squared deviation x² of the log of a scene's mean skin albedo from measured skin, in
-    standard `deviations` along and across the axis of skin tone; far out it grows with |x| only (pseudo-Huber), so that
-    painted faces are possible. `albedo` [3, S·L] at skin landmarks, `weight` [1, S·L] their shares, all 0 in scenes
-    that do not count, `radiance` [S] of `skin_radiance`.
+def tone_of_luminance(luminance: np.ndarray) -> np.ndarray:
+    """The measured skin of luminance [S], log linear RGB [3, S]; the mean where the luminance is NaN."""
+    shift = np.nan_to_num(np.log(luminance / SKIN_LUMINANCE)) / _SKIN_TONE_SLOPE
+    return SKIN_TONE_MEAN[:, None] + _AXIS[:, None] * shift
 
-    Photos are taken to be exposed for the light: along the axis, skin that is brighter in its photos than
-    `usual_radiance` is expected to be lighter by as much."""
-    scenes = len(radiance)
+
+def skin_tone_loss(albedo, weight, expected: np.ndarray, deviations: tuple[float, float]):
+    """Mean over scenes of the squared deviation x² of the log of a scene's mean skin albedo from the `expected` tone,
+    log RGB [3, S], in standard `deviations` along and across the axis of skin tone; far out it grows with |x| only
+    (pseudo-Huber), so that painted faces are possible. `albedo` [3, S·L] at skin landmarks, `weight` [1, S·L] their
+    shares, all 0 in scenes that do not count."""
+    scenes = expected.shape[1]
     mean = dr.sum(dr.reshape(albedo * in_three(weight), (3, scenes, -1)), axis=2)
     known = dr.sum(dr.reshape(weight, (1, scenes, -1)), axis=2)
-    axis = SKIN_TONE_AXIS / np.linalg.norm(SKIN_TONE_AXIS)
-    shift = np.nan_to_num(np.log(radiance / usual_radiance)) / _SKIN_TONE_SLOPE
-    centre = mi.TensorXf((SKIN_TONE_MEAN[:, None] + axis[:, None] * shift).astype(np.float32))
+    centre = mi.TensorXf(np.ascontiguousarray(expected, dtype=np.float32))
     deviation = dr.log(mean + in_three(1.0 - known) * dr.exp(centre)) - centre
-    along = mi.TensorXf(axis[None, :].astype(np.float32)) @ deviation
+    along = mi.TensorXf(_AXIS[None, :].astype(np.float32)) @ deviation
     along = dr.sum(along * along, axis=0)
     across = dr.sum(deviation * deviation, axis=0) - along
     wide, narrow = deviations

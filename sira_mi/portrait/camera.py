@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.portrait.landmarks import BROWS, JAW, MOUTH, OVAL, RIGID
 
 _FILM_DIAGONAL = 43.2666  # mm, of the 36 mm x 24 mm frame that EXIF's 35 mm focal length refers to
 
@@ -21,17 +22,6 @@ _SPREAD_DISTANCE = 0.5  # standard deviation of the logarithm
 # alike, so that all landmarks together count as this many independent ones.
 _LANDMARK_ERROR = 0.015  # of the face's height
 _INDEPENDENT_LANDMARKS = 30.0
-
-# Indices of the 468 landmarks.
-# fmt: off
-_OVAL = (10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152, 148, 176, 149,
-         150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109)
-_JAW = (397, 365, 379, 378, 400, 377, 152, 148, 176, 149, 150, 136, 172)
-_RIGID = (33, 133, 362, 263, 168, 6, 197, 195, 5, 4, 1, 2, 19, 94, 98, 327, 48, 278, 64, 294, 122, 351, 193, 417, 9, 8)
-_BROWS = (70, 63, 105, 66, 107, 46, 53, 52, 65, 55, 300, 293, 334, 296, 336, 276, 283, 282, 295, 285)
-_MOUTH = (61, 185, 40, 39, 37, 0, 267, 269, 270, 409, 291, 375, 321, 405, 314, 17, 84, 181, 91, 146, 78, 191, 80, 81,
-          82, 13, 312, 311, 310, 415, 308, 324, 318, 402, 317, 14, 87, 178, 88, 95)
-# fmt: on
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +125,7 @@ def landmark_weights(count: int) -> np.ndarray:
     weights = np.ones(count)
     if count == 468:
         weights[:] = 0.3
-        for group, weight in ((_BROWS, 0.6), (_OVAL, 0.25), (_JAW, 0.08), (_MOUTH, 0.08), (_RIGID, 3.0)):
+        for group, weight in ((BROWS, 0.6), (OVAL, 0.25), (JAW, 0.08), (MOUTH, 0.08), (RIGID, 3.0)):
             weights[list(group)] = weight
     return weights
 

@@ -32,7 +32,7 @@ from sira_mi.evaluate.portraits.benchmark_plan import (
     Identity,
     Shot,
     choose_identities,
-    held_out_heads,
+    heads_of,
     plan,
 )
 from sira_mi.evaluate.portraits.benchmark_portraits import NOTHING, PhotoSettings, View, draw_roughness, portrait_camera
@@ -80,9 +80,11 @@ def build_benchmark(
     collection was built with."""
     settings = settings or BenchmarkSettings()
     by_name = {source.name: source for source in sources}
-    heads = [head for head in held_out_heads(collection) if head.source in by_name]
+    heads = [head for head in heads_of(collection, settings.split) if head.source in by_name]
     if not heads:
-        raise InputError(f"{collection} has no test heads of {', '.join(by_name)}; build a larger collection")
+        raise InputError(
+            f"{collection} has no {settings.split} heads of {', '.join(by_name)}; build a larger collection"
+        )
     environments = sorted(hdri.glob("*.exr")) if hdri is not None else []
     if hdri is not None and not environments:
         raise InputError(f"{hdri}: no .exr environment maps found")

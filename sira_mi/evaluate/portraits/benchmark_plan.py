@@ -1,4 +1,4 @@
-"""Which test heads of a collection the benchmark shows, and how each is photographed: camera and lights."""
+"""Which heads of a collection the benchmark shows, and how each is photographed: camera and lights."""
 
 import hashlib
 import json
@@ -35,13 +35,14 @@ WORN = 0.01  # share of a head's points from which it has hair, or clothes
 class BenchmarkSettings:
     identities: int = 12
     seed: int = 0
+    split: str = "test"  # whose heads are photographed; portraits of training heads may tune a fit, never score it
     primary_only: bool = False  # one light of each identity instead of three
     photo: PhotoSettings = field(default_factory=PhotoSettings)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """A test head of a collection."""
+    """A head of a collection."""
 
     source: str
     number: int
@@ -107,11 +108,13 @@ class Shot:
         }
 
 
-def named_sources(collection: Path, names: list[str] | None, data: dict[str, Path | None]) -> tuple[Source, ...]:
-    """The sources of a collection's test heads, or those of them in `names`, over the data (by the names `hair`, `ict`,
-    `valid` and `meshes`) that it was built with. Raises InputError for a name of no source, and when the data of a
-    source are not given."""
-    present = list(dict.fromkeys(entry["source"] for entry in manifest_entries(collection, "test")))
+def named_sources(
+    collection: Path, split: str, names: list[str] | None, data: dict[str, Path | None]
+) -> tuple[Source, ...]:
+    """The sources of a collection's heads of `split`, or those of them in `names`, over the data (by the names `hair`,
+    `ict`, `valid` and `meshes`) that it was built with. Raises InputError for a name of no source, and when the data of
+    a source are not given."""
+    present = list(dict.fromkeys(entry["source"] for entry in manifest_entries(collection, split)))
     try:
         counts = json.loads((collection / "manifest.json").read_text(encoding="utf-8"))["settings"]["sources"]
     except (KeyError, TypeError) as error:
@@ -119,16 +122,17 @@ def named_sources(collection: Path, names: list[str] | None, data: dict[str, Pat
     wanted = present if names is None else names
     for name in wanted:
         if name not in present:
-            raise InputError(f"{collection} has no test heads of {name}; it has some of {', '.join(present)}")
+            raise InputError(f"{collection} has no {split} heads of {name}; it has some of {', '.join(present)}")
         if name in data and data[name] is None:
             raise InputError(f"{collection} has heads of {name}: give its data by --{name}, or choose other --sources")
     described = Namespace(**data, count=counts.get("makehuman", 0), ict_count=counts.get("ict", 0))
     return tuple(source for source in sources_of(described) if source.name in wanted)
 
 
-def held_out_heads(collection: Path) -> list[Identity]:
-    """The test heads of a collection, in the manifest's order. Raises InputError when a scene cannot be read."""
-    return [_identity(collection, entry) for entry in manifest_entries(collection, "test")]
+def heads_of(collection: Path, split: str) -> list[Identity]:
+    """The heads of a collection's `split`, "test" or "train", in the manifest's order. Raises InputError when a scene
+    cannot be read."""
+    return [_identity(collection, entry) for entry in manifest_entries(collection, split)]
 
 
 def _identity(collection, entry):

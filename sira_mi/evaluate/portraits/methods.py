@@ -85,9 +85,9 @@ def _without_prior(shipped: Stages) -> Stages:
 
 
 def _with_relief(shipped: Stages) -> Stages:
-    """As many relief steps as the albedo stage has; no shipped quality has the stage."""
+    """As many relief steps as the light stage has; no shipped quality has the stage."""
     stages = _of_kind(APPEARANCE)(shipped)
-    return with_relief(stages, next(stage.steps for _, stage in stages if stage.name == "albedo"))
+    return with_relief(stages, next(stage.steps for _, stage in stages if stage.name == "light"))
 
 
 def _without_refinement(shipped: Stages) -> Stages:
