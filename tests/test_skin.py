@@ -75,7 +75,8 @@ def test_the_white_of_the_eyes_tells_light_from_skin(variant, portrait):
     assert 0.07 < levels[0] < levels[1] < levels[2] < 0.45
     assert levels[0] < skin_luminance(SkinCues(0.2, None)) < levels[2]
     sunglasses = dataclasses.replace(one, image=np.where(one.image > USUAL * 1.01, 0, one.image))
-    assert skin_luminance(skin_cues(sunglasses)) < 0.8
+    assert skin_luminance(skin_cues(sunglasses)) < 0.5
+    assert skin_luminance(SkinCues(1e-3, -6.0)) > 0.03
 
 
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):

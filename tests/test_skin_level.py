@@ -6,6 +6,8 @@ from egg import SIZE, SKIN, head_like, landmarks_on, truth_of
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
+from sira_mi.evaluate import __main__ as command
+from sira_mi.evaluate.portraits import skin_level
 from sira_mi.evaluate.portraits.skin_level import Observation, estimate, true_luminance
 from sira_mi.fit.skin import SkinCues
 
@@ -52,3 +54,18 @@ def test_the_true_level_is_that_of_skin_near_the_landmarks():
     truth.region[truth.region == SKIN] = 1
     assert true_luminance(truth) is None
     assert truth.mask.shape == (SIZE, SIZE)
+
+
+def test_the_command_prints_the_constants_of_the_fit(monkeypatch, capsys, tmp_path):
+    """Coefficients and errors by skin alone and with the eyes, or one line that says what is missing."""
+    monkeypatch.setattr("sys.argv", ["evaluate", "skin", "--benchmark", str(tmp_path)])
+    with pytest.raises(InputError, match="no benchmark"):
+        command.main()
+    monkeypatch.setattr(skin_level, "observe", lambda folder: (observations(0.0), ["blind"]))
+    command.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("60 portraits") and lines[0].endswith("unseen: 1")
+    assert lines[2] == "by skin and eyes: -1.00, 0.20, 0.60; error 0.00"
+    monkeypatch.setattr(skin_level, "observe", lambda folder: ([], ["blind"]))
+    with pytest.raises(InputError, match="0 portraits of 0 heads"):
+        command.main()

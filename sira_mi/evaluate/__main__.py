@@ -139,12 +139,12 @@ def measure_skin(arguments: argparse.Namespace) -> None:
     from sira_mi.evaluate.portraits.skin_level import estimate, observe
 
     observations, blind = observe(arguments.benchmark)
+    estimates = {title: estimate(observations, eyes) for title, eyes in (("skin", False), ("skin and eyes", True))}
     spread = np.std(np.log([o.luminance for o in observations]))
     print(f"{len(observations)} portraits, log of the skin's luminance within {spread:.2f}; unseen: {len(blind)}")
-    for title, eyes in (("by skin", False), ("by skin and eyes", True)):
-        found = estimate(observations, eyes)
+    for title, found in estimates.items():
         values = ", ".join(f"{value:.2f}" for value in found.coefficients)
-        print(f"{title}: {values}; error {found.error:.2f}")
+        print(f"by {title}: {values}; error {found.error:.2f}")
 
 
 def make_benchmark(arguments: argparse.Namespace) -> None:

@@ -34,8 +34,8 @@ _WHITE = 90
 # heads: a constant, what it rises with the log radiance of the skin and with the log of that over the eyes' white.
 _BY_SKIN = (-1.12, 0.23)
 _BY_SKIN_AND_EYES = (-1.05, 0.14, 0.57)
-# The log of skin over the eyes' white lies in this range; what is seen beyond is no open eye in the skin's light.
-_OVER_WHITE = (-3.0, 1.0)
+# Skin is neither darker nor lighter, L* 30 to 73; cues that say so are of no open eye in the skin's light.
+_SKIN = (0.06, 0.45)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _over_white(portrait: Portrait) -> float | None:
         if inside.any():
             white = np.percentile(portrait.image[inside] @ np.array(LUMINANCE), _WHITE)
             contrasts.append(np.log(np.median(skin) / max(white, _DARKEST)))
-    return float(np.clip(np.mean(contrasts), *_OVER_WHITE)) if contrasts else None
+    return float(np.mean(contrasts)) if contrasts else None
 
 
 def face_exposure(portrait: Portrait) -> float:
@@ -101,9 +101,11 @@ def skin_luminance(cues: SkinCues) -> float:
     """Luminance of the albedo of skin in a photo with these cues."""
     if cues.over_white is None:
         constant, by_radiance = _BY_SKIN
-        return float(np.exp(constant + by_radiance * np.log(cues.radiance)))
-    constant, by_radiance, by_white = _BY_SKIN_AND_EYES
-    return float(np.exp(constant + by_radiance * np.log(cues.radiance) + by_white * cues.over_white))
+        level = constant + by_radiance * np.log(cues.radiance)
+    else:
+        constant, by_radiance, by_white = _BY_SKIN_AND_EYES
+        level = constant + by_radiance * np.log(cues.radiance) + by_white * cues.over_white
+    return float(np.clip(np.exp(level), *_SKIN))
 
 
 @dataclass(frozen=True)
