@@ -12,8 +12,6 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
-
 from sira_mi.errors import CommandParser, InputError, run_command
 
 
@@ -134,6 +132,7 @@ def compare_fits(arguments: argparse.Namespace) -> None:
 def measure_skin(arguments: argparse.Namespace) -> None:
     """Prints what the cues of `sira_mi.fit.skin` tell of the skin's albedo, over a benchmark's portraits."""
     import mitsuba as mi
+    import numpy as np
 
     mi.set_variant(arguments.variant)
     from sira_mi.evaluate.portraits.skin_level import estimate, observe

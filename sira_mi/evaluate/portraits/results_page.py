@@ -320,8 +320,8 @@ strict (23.9 dB); at `draft` twice the steps for light, albedo and speculars (24
   quarter of the weight of the colour: 1.37 and 1.34 mm, where 1.34 is shipped. Three seeds each of two photos ended
   within 0.14 mm of each other: there is little that a mean over seeds could take out.
 - **Normals.** Errors are largest at eyelids, the wings of the nose, the mouth, ears and the edge of the hair: detail
-  that the prior does not have. Relief helps here and the albedo (b.4; at `standard`, with 182 steps of geometry and
-  the skin's level by brightness: normals 9.9°, diffuse albedo scaled 26.0 dB), but on the portrait of scikit-image it
+  that the prior does not have. Relief helps here and the albedo (at `standard`, with 182 steps of geometry and the
+  skin's level by brightness: normals 9.9°, diffuse albedo scaled 26.0 dB), but on the portrait of scikit-image it
   bends brows, eyes and mouth, whose pattern the albedo's prior cannot paint; without these three, it bends the
   fringe. On bare skin only it does not help: normals of the skin 11.4° → 11.6°, where relief everywhere has 11.1°,
   diffuse albedo 22.1 → 22.1 dB, where it has 23.1. What it mends lies at hair, neck and edges.
