@@ -340,6 +340,8 @@ def test_a_benchmark_holds_photos_and_truth(built):
     focal length, the truth passes the evaluation's own checks, and the head is in the picture."""
     folder, settings, _, entries = built
     assert benchmark.read_benchmark(folder) == entries
+    with pytest.raises(InputError, match="shows test heads"):
+        benchmark.read_benchmark(folder, "train")
     assert [entry["light"] for entry in entries] == list(LIGHTS)
     assert [entry["primary"] for entry in entries] == [True, False, False]
     for entry in entries:

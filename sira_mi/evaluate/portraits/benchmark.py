@@ -230,17 +230,21 @@ def finished_entry(folder: Path, key: str) -> dict | None:
         return None
 
 
-def read_benchmark(folder: Path) -> list[dict]:
-    """The entries of a benchmark's portraits. Raises InputError when it is missing, damaged or incomplete."""
+def read_benchmark(folder: Path, split: str = "test") -> list[dict]:
+    """The entries of a benchmark's portraits. Raises InputError when it is missing, damaged, incomplete, or of heads of
+    another `split`."""
     path = folder / "benchmark.json"
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise InputError(f"{path} is of format {data['format']}, not {FORMAT}; build it again")
+        shown = data.get("settings", {}).get("split", "test")
         entries = list(data["portraits"])
         names = [entry["name"] for entry in entries]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: no benchmark ({error}); run python -m sira_mi.evaluate benchmark") from error
+    if shown != split:
+        raise InputError(f"{folder} shows {shown} heads, not {split} heads; build one with --split {split}")
     for name in names:
         if Path(name).name != name:
             raise InputError(f"{path}: {name!r} is not the name of a portrait")

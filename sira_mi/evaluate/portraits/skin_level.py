@@ -40,11 +40,12 @@ class Estimate:
 
 
 def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
-    """The skin of the portraits in a benchmark's folder, and the names of those without a face or visible skin."""
+    """The skin of the portraits of training heads in a folder, and the names of those without a face or visible skin.
+    Raises InputError for portraits of test heads."""
     landmarks = load_avatar(PRIOR).tensors["landmarks"]
     settings = PortraitSettings(working_size=QUALITIES["draft"].working_size)
     found, blind = [], []
-    for entry in tqdm(read_benchmark(benchmark), unit="portrait", dynamic_ncols=True):
+    for entry in tqdm(read_benchmark(benchmark, "train"), unit="portrait", dynamic_ncols=True):
         folder = benchmark / entry["name"]
         luminance = true_luminance(load_truth(folder / "truth.npz"))
         try:
