@@ -16,10 +16,10 @@ from sira_mi.fields.mlp import layers, pack
 from sira_mi.models.avatar import load_avatar
 
 
-def find_avatar(props) -> str:
-    """The path in a plugin's `avatar` property: relative to the scene file's folder if it is found there, else to the
-    current one; empty for the shipped prior."""
-    path = props.get("avatar", "")
+def find_avatar(props, name: str = "avatar") -> str:
+    """The path in a plugin's property `name`: relative to the scene file's folder if it is found there, else to the
+    current one; empty where none is given."""
+    path = props.get(name, "")
     return str(mi.file_resolver().resolve(path)) if path else ""
 
 

@@ -3,11 +3,14 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError
+from sira_mi.fields.appearance import light_refinement
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
+from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
-from sira_mi.plugins.neural_albedo import NeuralAlbedo
+from sira_mi.models.avatar import load_avatar
+from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
@@ -47,6 +50,11 @@ class SiraSG(mi.SamplingIntegrator):
        - |bool|
        - Samples of one pixel that all see the head within 4 mm of the field, with normals within 15 degrees, are shaded
          once, at the one in their middle; what the head covers is still found by the sample. (Default: false)
+     * - light_refinement
+       - |string|
+       - An `avatar.safetensors` whose refinement of the light the radiance is multiplied by: of what the photo shows
+         and eq. 8 does not, the part that is not the person's albedo. It holds in the fitted light of that avatar
+         alone. An avatar without one has 1 everywhere. (Default: empty, no refinement)
      * - shaded_lobes
        - |tensor|
        - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. (Default: all)
@@ -60,9 +68,9 @@ class SiraSG(mi.SamplingIntegrator):
 
     Where k_s is 0 and not differentiated, the specular part is not computed.
 
-    Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s), `diffuse_albedo.RGB`, `specular_albedo`,
-    `normal.XYZ` (world, of the field), `depth` (along the ray from the sensor's near plane, as of `aov`, in scene
-    units) and `mask` (1 on the head). All are zero off the head.
+    Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s, without `light_refinement`),
+    `diffuse_albedo.RGB`, `specular_albedo`, `normal.XYZ` (world, of the field), `depth` (along the ray from the
+    sensor's near plane, as of `aov`, in scene units) and `mask` (1 on the head). All are zero off the head.
 
     Where something is differentiated, hits are exact, every sample has its own shading and all lobes are summed up,
     whatever the options say. Differentiable in everything that the scene exposes: lobes, albedo networks and latents,
@@ -89,6 +97,7 @@ class SiraSG(mi.SamplingIntegrator):
         self.aovs = bool(props.get("aovs", True))
         self.exact = bool(props.get("exact", True))
         self.shared = bool(props.get("shared", False))
+        self.refinement = light_refinement_of(find_avatar(props, "light_refinement"))
         self.shaded_lobes = np.array(props["shaded_lobes"]).astype(int) if "shaded_lobes" in props else None
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -122,6 +131,8 @@ class SiraSG(mi.SamplingIntegrator):
             background = light.eval(si, active & ~hit)
         index = dr.compress(hit)
         rows_of = _ROWS if self.aovs else {name: _ROWS[name] for name in ("diffuse", "specular")}
+        if self.refinement is not None:
+            rows_of = {**rows_of, "light": 3}
         kinds = {name: mi.Color3f if rows == 3 else mi.Float for name, rows in rows_of.items()}
         parts = {name: dr.zeros(kind, width) for name, kind in kinds.items()}
         if dr.width(index) > 0:
@@ -134,7 +145,10 @@ class SiraSG(mi.SamplingIntegrator):
         if leader is not None:
             t, hit = dr.gather(mi.Float, t, leader), dr.gather(mi.Bool, hit, leader)
             parts = {name: dr.gather(kinds[name], part, leader) for name, part in parts.items()}
-        color = dr.select(hit, parts["diffuse"] + parts["specular"], background)
+        radiance = parts["diffuse"] + parts["specular"]
+        if self.refinement is not None:
+            radiance *= parts["light"]
+        color = dr.select(hit, radiance, background)
         valid = active & (hit | (not self.hide_environment))
         if not self.aovs:
             return color, valid, []
@@ -151,9 +165,9 @@ class SiraSG(mi.SamplingIntegrator):
         return color, valid, aovs
 
     def _shade(self, scene, head, bsdf, light, ray, t, index, attached, on_mesh):
-        """All of `_ROWS` at the hits `index`, as one tensor [13, n], or the radiances [6, n] without extra channels; in
-        chunks when nothing is differentiated. `on_mesh` are the interactions with the mesh, None where hits are
-        exact."""
+        """All of `_ROWS` at the hits `index`, as one tensor [13, n], or the radiances [6, n] without extra channels,
+        and the factor [3, n] of the light's refinement, if there is one; in chunks when nothing is differentiated.
+        `on_mesh` are the interactions with the mesh, None where hits are exact."""
         field = head.field()
         local = head.to_local @ ray
         origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
@@ -191,23 +205,32 @@ class SiraSG(mi.SamplingIntegrator):
             _, gradient, x_ref, gamma = surface(field, x)
             diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
             specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1) if speculars or self.aovs else None
-            return shaded(x, direction, normalised(gradient), diffuse, specular)
+            refined = [] if self.refinement is None else [self._light(x_ref, gamma)]
+            return shaded(x, direction, normalised(gradient), diffuse, specular, *refined)
 
-        def shaded(x, direction, normal, diffuse, specular):
+        def shaded(x, direction, normal, diffuse, specular, *refined):
             radiance = radiances(x, normal, normalised(direction), diffuse, specular)
             extra = (diffuse, specular, rotation @ normal) if self.aovs else ()
-            return dr.concat([*radiance, *extra], axis=0)
+            return dr.concat([*radiance, *extra, *refined], axis=0)
 
         if on_mesh is not None:
             inverse = mi.TensorXf(np.ascontiguousarray(rotation_of(head.to_world).T))
             x, normal = to_columns(head.to_local @ on_mesh.p), inverse @ to_columns(on_mesh.sh_frame.n)
-            at_mesh = (x, direction, normal, *mesh_albedos(head, bsdf, on_mesh, x))
+            at_mesh = [x, direction, normal, *mesh_albedos(head, bsdf, on_mesh, x)]
+            if self.refinement is not None:
+                factor = evaluate_in_chunks(lambda p: self._light(*deform(field, p)), x.numpy())[0]
+                at_mesh.append(mi.TensorXf(factor))
             return mi.TensorXf(evaluate_in_chunks(shaded, *(a.numpy() for a in at_mesh))[0])
         if not attached:
             x = on_ray(origin, direction, parameter)
             return mi.TensorXf(evaluate_in_chunks(columns, x.numpy(), direction.numpy())[0])
         parameter = dr.detach(parameter)
         return columns(differentiable_hit(field, origin, direction, parameter), direction)
+
+    def _light(self, x_ref, gamma):
+        """The factor [3, N] of the light's refinement."""
+        network, octaves = self.refinement
+        return dr.exp(light_refinement(network, octaves, x_ref, gamma))
 
     def _shaded(self, lobes):
         """Those of `lobes` [N_l, 7] that the closed form sums up."""
@@ -228,6 +251,16 @@ class SiraSG(mi.SamplingIntegrator):
 
     def to_string(self):
         return f"SiraSG[hide_emitters = {self.hide_environment}, visibility = {self.visibility}]"
+
+
+def light_refinement_of(path: str) -> tuple | None:
+    """Layers of the network of an avatar file that refines the light, and the octaves of its encoding; None without
+    a path and where the avatar has none."""
+    avatar = load_avatar(path) if path else None
+    if avatar is None or "light_refinement" not in avatar.tensors:
+        return None
+    network = avatar.architecture.networks["light_refinement"]
+    return layers(network, mi.Float(avatar.tensors["light_refinement"])), avatar.architecture.refinement_octaves
 
 
 def mesh_hits(scene, head, ray, active):

@@ -17,14 +17,14 @@ def truth() -> Truth:
 
 
 def appearance_of(truth: Truth, **changes) -> PredictedAppearance:
-    whole = {"final": truth.image, "mask": truth.mask}
+    whole = {"final": truth.image, "shaded": truth.image, "mask": truth.mask}
     whole |= {name: getattr(truth, name) for name in ("diffuse_albedo", "specular_albedo")}
     return PredictedAppearance(**(whole | changes))
 
 
 def test_the_truth_itself_has_no_error(truth):
     scores = score_appearance(appearance_of(truth), truth)
-    for name in ("final", "diffuse", "diffuse_scaled", "specular", "specular_scaled"):
+    for name in ("final", "shaded", "diffuse", "diffuse_scaled", "specular", "specular_scaled"):
         assert scores[f"{name}_psnr"] > 100 and scores[f"{name}_ssim"] == pytest.approx(1, abs=1e-6)
     assert scores["skin_ciede2000_mean"] < 1e-3 and scores["leakage_shading"] == scores["leakage_shadow"] == 0
     inner = sum(truth.mask[1 + i : SIZE - 1 + i, 1 + j : SIZE - 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)) > 8.5
@@ -45,9 +45,12 @@ def test_errors_of_known_size_have_their_psnr(truth):
     flat = dataclasses.replace(truth, **grey, specular_albedo=np.full((SIZE, SIZE), 0.08 * linear(0.5)))
     lighter = np.where(truth.mask[..., None] > 0, linear(0.6), [7.0, 7, 7])
     scores = score_appearance(
-        appearance_of(flat, final=lighter, diffuse_albedo=lighter, specular_albedo=0.08 * lighter[..., 0]), flat
+        appearance_of(
+            flat, final=lighter, shaded=lighter, diffuse_albedo=lighter, specular_albedo=0.08 * lighter[..., 0]
+        ),
+        flat,
     )
-    for name in ("final", "diffuse", "specular"):
+    for name in ("final", "shaded", "diffuse", "specular"):
         assert scores[f"{name}_psnr"] == pytest.approx(20, abs=1e-3) and scores[f"{name}_ssim"] < 1
     assert scores["diffuse_scaled_psnr"] > 100 and scores["specular_scaled_ssim"] == pytest.approx(1, abs=1e-6)
     lab = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ([v] * 3)) for v in (0.6, 0.5)]

@@ -43,6 +43,18 @@ def test_round_trip(avatar, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+def test_a_refined_light_comes_back_and_may_be_missing(avatar, tmp_path):
+    """A prior has none; one of another size is refused."""
+    network = avatar.architecture.networks["light_refinement"]
+    assert "light_refinement" not in avatar.tensors
+    refined = avatar.replaced(light_refinement=np.arange(network.parameters, dtype=np.float32))
+    save_avatar(tmp_path / "a", refined)
+    back = load_avatar(tmp_path / "a").tensors["light_refinement"]
+    np.testing.assert_array_equal(back, refined.tensors["light_refinement"])
+    save_avatar(tmp_path / "a", avatar.replaced(light_refinement=np.zeros(3, np.float32)))
+    assert "light_refinement" in complaint(tmp_path / "a")
+
+
 def test_the_same_avatar_is_the_same_bytes(avatar, tmp_path):
     shuffled = Avatar(avatar.architecture, dict(reversed(avatar.tensors.items())))
     save_avatar(tmp_path / "a", avatar)

@@ -70,17 +70,23 @@ def test_output_folder_is_complete_and_consistent(finished):
     avatar = load_avatar(finished / "avatar.safetensors")
     stored = json.loads((finished / "lights.json").read_text())["lobes"]
     assert np.allclose([lobe["amplitude"] for lobe in stored], avatar.tensors["lobes"][:, 4:7], rtol=1e-5)
-    assert avatar.k_s == 1 and avatar.k_r == 1
+    assert avatar.k_s == 1 and avatar.k_r == 1 and "light_refinement" in avatar.tensors
 
 
 def test_scene_file_shows_the_same_picture(finished):
-    """`mi.load_file("scene.xml")` renders what `renders/final.exr` holds, in the photo's camera."""
+    """`mi.load_file("scene.xml")` renders the sum of `renders/diffuse.exr` and `renders/specular.exr` in the photo's
+    camera; with the avatar's refinement of the light, `renders/final.exr`."""
     scene = mi.load_file(str(finished / "scene.xml"), voxel=0.12)
-    image = mi.render(scene, spp=8).numpy()
-    final = np.array(mi.Bitmap(str(finished / "renders" / "final.exr")))
+    final, diffuse, specular = (
+        np.array(mi.Bitmap(str(finished / "renders" / f"{name}.exr"))) for name in ("final", "diffuse", "specular")
+    )
     mask = np.asarray(Image.open(finished / "renders" / "mask.png")) == 255
     assert mask.any()
-    assert np.median(np.abs(image[..., :3] - final)[mask]) < 0.01
+    refined = mi.load_dict({"type": "sira_sg", "light_refinement": str(finished / "avatar.safetensors")})
+    for integrator, expected in ((scene.integrator(), diffuse + specular), (refined, final)):
+        image = mi.render(scene, integrator=integrator, spp=8).numpy()
+        assert np.median(np.abs(image[..., :3] - expected)[mask]) < 0.01
+    assert np.abs(final - diffuse - specular)[mask].mean() > 1e-4
 
 
 def test_only_what_each_stage_names_is_moved(finished):

@@ -11,8 +11,11 @@ from scipy.ndimage import binary_erosion
 
 from sira_mi import scene as scenes
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.appearance import light_refinement
+from sira_mi.fields.mlp import initial_parameters, layers
+from sira_mi.fields.sdf import deform, evaluate_in_chunks, signed_distance, surface
 from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
+from sira_mi.models.avatar import save_avatar
 from sira_mi.portrait.camera import Camera
 
 CENTRES = {"type": "stratified", "jitter": False, "sample_count": 1}
@@ -249,6 +252,36 @@ def test_channels_of_the_closed_form(shaded, shaded_image):
         assert (part[name][mask] >= 0).all() and part[name][mask].max() > 0.01
     for name, values in part.items():
         assert (values[~mask] == 0).all(), name
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_refined_light_multiplies_the_radiance_alone(avatar, avatar_path, tmp_path, exact):
+    """By exp of the network at the hit, in reference space; the channels are those of eq. 8. An avatar without a
+    refinement changes nothing."""
+    rng = np.random.default_rng(8)
+    network = avatar.architecture.networks["light_refinement"]
+    parameters = initial_parameters(network, rng, output_scale=0.5)
+    path = tmp_path / "refined.safetensors"
+    save_avatar(path, avatar.replaced(light_refinement=parameters))
+
+    def image(**options):
+        integrator = {"type": "sira_sg", "hide_emitters": True, "exact": exact, **options}
+        scene = build(avatar_path, avatar, integrator)
+        return scene, mi.render(scene).numpy()
+
+    scene, plain = image()
+    refined = image(light_refinement=str(path))[1]
+    for same, other in ((image(light_refinement=avatar_path)[1], plain), (refined[..., 4:], plain[..., 4:])):
+        np.testing.assert_allclose(same, other, rtol=1e-5, atol=1e-6)
+    mask = plain[..., SG_CHANNELS["mask"]] > 0
+    rows, columns = np.nonzero(mask)
+    origin, direction = pixel_rays(camera(30, SIZE), columns, rows)
+    x = (origin + direction * plain[..., SG_CHANNELS["depth"]][mask][:, None]).T
+    x_ref, gamma = deform(head_of(scene).field(), mi.TensorXf(np.ascontiguousarray(x, np.float32)))
+    layer = layers(network, mi.Float(parameters))
+    factor = np.exp(light_refinement(layer, avatar.architecture.refinement_octaves, x_ref, gamma).numpy()).T
+    np.testing.assert_allclose(refined[mask][:, :3], factor * plain[mask][:, :3], rtol=5e-3)
+    assert factor.std() > 0.05
 
 
 def test_normals_are_world_normals_of_a_turned_head(avatar, avatar_path, shaded_image):

@@ -39,6 +39,7 @@ def test_ablations_are_those_of_the_paper():
     assert "albedo_refinement" not in moved("b.2") and "albedo_refinement" in moved("b.3")
     assert "deformation" not in moved("b.3") and "deformation" in moved("b.4")
     assert moved("b.5") == {"z_l", "illumination", "z_s", "albedo_refinement"}
+    assert moved("b.3") - moved("b.7") == {"light_refinement"} and moved("b.6") == moved("b.3")
     assert [kind for kind, _ in BY_NAME["b.4"].settings(DRAFT).stages].count(RELIEF) == 1
     assert not BY_NAME["a.1"].deforms and BY_NAME["a.2"].settings(DRAFT).geometry.stay == 0
 
@@ -52,7 +53,7 @@ def test_a_method_and_what_it_goes_on_from_take_the_steps_of_the_fit():
         steps = sum(stage.steps for _, stage in method.settings(DRAFT).stages)
         if method.after is None:
             assert steps == lengths[GEOMETRY]
-        elif method.name in ("b.1", "b.3"):
+        elif method.name in ("b.1", "b.3", "b.7"):
             assert steps == lengths[APPEARANCE]
     for quality in QUALITIES.values():
         shipped = BY_NAME["a.4"].settings(quality).stages + BY_NAME["b.3"].settings(quality).stages

@@ -54,7 +54,7 @@ def main() -> None:
     fits.add_argument(
         "--ablations", choices=("draft", "standard", "high"), default="draft", help="quality of all methods"
     )
-    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.1 to b.6)")
+    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.1 to b.7)")
     fits.add_argument(
         "--portraits", nargs="+", default=(), metavar="NAME", help="portraits (default: the primary ones)"
     )

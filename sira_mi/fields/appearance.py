@@ -53,6 +53,11 @@ def refined_albedo(base, refinement, k_r):
     return dr.minimum(dr.maximum(base + k_r * refinement, 0.0), 1.0)
 
 
+def light_refinement(network: list[tuple], octaves: int, x_ref, gamma):
+    """Logarithm [3, N] of the factor by which more light than eq. 8 has it arrives in the photo, in [-4, 4]."""
+    return 4.0 * dr.tanh(0.25 * evaluate(network, dr.concat([encode(x_ref, octaves), gamma], axis=0)))
+
+
 def diffuse_albedo_cooperative(packed, octaves: int, x_ref: list, gamma: list) -> list:
     """`diffuse_albedo` in symbolic code."""
     return [_logistic(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves) + gamma)]

@@ -5,10 +5,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, refined_albedo
+from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, light_refinement, refined_albedo
+from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fields.sdf import evaluate_in_chunks, in_three
+from sira_mi.fit.residual import albedo_shares, albedo_variances, light_variances, log_residual, share_loss
 from sira_mi.fit.settings import FitSettings, Stage
-from sira_mi.fit.shaded import base_albedo, decoder, photo_points, shade_points
+from sira_mi.fit.shaded import PhotoPoints, base_albedo, decoder, photo_points, shade_points
 from sira_mi.fit.skin import skin_patches
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar
@@ -33,19 +35,39 @@ class AppearanceProblem:
         head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": settings.voxel})
         self.points = photo_points(portrait, head, settings.shadows)
         self.skin = skin_patches(portrait, self.points)
+        self.albedo_variances = albedo_variances(portrait, self.points.row, self.points.column)
         self.target = np.ascontiguousarray(portrait.image[self.points.row, self.points.column].T, dtype=np.float32)
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's
-        to the rendered mean radiance at the prior's albedo, as one factor for all channels."""
-        if stage.k_s[1] > 0 or "z_a" in stage.rates:
-            return {}
+        to the rendered mean radiance at the prior's albedo, as one factor for all channels. Before it is refined, it
+        is settled which shares of the residual are the albedo's; the refinement of the light starts from 1."""
         self.refresh(tensors)
         index = self._draw(np.random.default_rng(0))
-        points = self.points[index]
-        shading = shade_points(self.avatar, self._fixed, 0.0, points, base_albedo(self.avatar, self._fixed, points))
-        factor = self.target[:, index].mean() / max(float(shading.diffuse.numpy().mean()), 1e-6)
-        return {"illumination": exposed(self.avatar, tensors["illumination"], factor)}
+        if stage.k_s[1] == 0 and "z_a" not in stage.rates:
+            diffuse, _ = self._base_radiance(self.points[index], stage.k_s[0])
+            factor = self.target[:, index].mean() / max(float(diffuse.mean()), 1e-6)
+            return {"illumination": exposed(self.avatar, tensors["illumination"], factor)}
+        if not _refines_light(stage):
+            return {}
+
+        def radiance(points: PhotoPoints) -> np.ndarray:
+            return sum(self._base_radiance(points, stage.k_s[0]))
+
+        diffuse, specular = self._base_radiance(self.points[index], stage.k_s[0])
+        residual = log_residual(self.target[:, index] - specular, diffuse)
+        light = light_variances(radiance, self.points, index, seed=0)
+        network = self.avatar.architecture.networks["light_refinement"]
+        return {
+            "light_refinement": initial_parameters(network, np.random.default_rng(0), output_scale=0.0),
+            "albedo_shares": albedo_shares(residual, index, self.albedo_variances, light),
+        }
+
+    def _base_radiance(self, points: PhotoPoints, k_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Diffuse and specular radiance [3, n] of the base albedo at `points`."""
+        with dr.suspend_grad():
+            shading = shade_points(self.avatar, self._fixed, k_s, points, base_albedo(self.avatar, self._fixed, points))
+            return shading.diffuse.numpy(), shading.specular.numpy()
 
     def _draw(self, rng: np.random.Generator) -> np.ndarray:
         count = self.target.shape[1]
@@ -53,6 +75,7 @@ class AppearanceProblem:
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Makes arrays of all tensors, those that the stage holds fixed included."""
+        self.shares = tensors.get("albedo_shares")
         self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
         decoder_of_base = tensors["diffuse_albedo"], tensors["z_a"]
         if self._base_at is None or not all(map(np.array_equal, self._base_at, decoder_of_base)):
@@ -96,8 +119,14 @@ class AppearanceProblem:
             albedo = refined_albedo(base, fine, stage.k_r)
         shading = shade_points(self.avatar, current, k_s, points, albedo)
         target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
+        radiance = shading.diffuse + shading.specular
+        if _refines_light(stage):
+            of_light = light_refinement(
+                decoder(self.avatar, "light_refinement", current), a.refinement_octaves, x_ref, gamma
+            )
+            radiance = radiance * dr.exp(of_light)
         terms = {
-            "color": losses.photometric_loss(shading.diffuse + shading.specular, target),
+            "color": losses.photometric_loss(radiance, target),
             "embedding": weights.embedding
             * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"])),
             "white_light": weights.white_light * _chroma(shading.lobes),
@@ -110,6 +139,8 @@ class AppearanceProblem:
             base_diffuse = shading.diffuse * (base / dr.maximum(albedo, 1e-4))
             terms["refinement"] = weights.refinement * self._refinement_loss(fine, base, base_diffuse, shading.specular)
             terms["smoothness"] = weights.smoothness * losses.mean(dr.abs(rough))
+        if _refines_light(stage):
+            terms["shares"] = weights.shares * share_loss(base, albedo, of_light, self.shares[:, index])
         return terms
 
     def _refinement_loss(self, fine, base, base_diffuse, specular_radiance):
@@ -120,6 +151,10 @@ class AppearanceProblem:
         w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(specular_radiance))
         length = dr.sqrt(dr.sum(fine * fine, axis=0) + 1e-8)
         return losses.mean(length * w)
+
+
+def _refines_light(stage: Stage) -> bool:
+    return "light_refinement" in stage.rates
 
 
 def exposed(avatar: Avatar, illumination_parameters: np.ndarray, factor: float) -> np.ndarray:

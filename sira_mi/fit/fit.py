@@ -32,7 +32,7 @@ from sira_mi.fit.settings import (
     polish_stage,
     without,
 )
-from sira_mi.models.avatar import PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.models.avatar import OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
 from sira_mi.plan.decisions import Plan, explain
 from sira_mi.plan.fit import plan_fit
 from sira_mi.portrait.load import linear_to_srgb
@@ -261,7 +261,7 @@ def stage_problems(
     def on_fitted(problem: Callable) -> Callable[[dict], object]:
         def make(tensors):
             path = work / "geometry.safetensors"
-            save_avatar(path, prior.replaced(**{k: v for k, v in tensors.items() if k in prior.tensors}))
+            save_avatar(path, prior.replaced(**avatar_tensors(tensors, prior)))
             return problem(with_pose(portrait, tensors), prior, str(path), settings)
 
         return make
@@ -274,12 +274,17 @@ def stage_problems(
     }
 
 
+def avatar_tensors(tensors: dict[str, np.ndarray], prior: Avatar) -> dict[str, np.ndarray]:
+    """Those of a fit's tensors that are kept in its avatar."""
+    return {name: value for name, value in tensors.items() if name in (*prior.tensors, *OPTIONAL)}
+
+
 def finished_avatar(prior: Avatar, progress: Progress, settings: FitSettings) -> Avatar:
     """The avatar at the fit's last parameters, its light decoded to lobes; k_s and k_r are those of the stages that
     were reached."""
     from sira_mi.fit.shaded import decode_lobes
 
-    tensors = {k: v for k, v in progress.tensors.items() if k in prior.tensors}
+    tensors = avatar_tensors(progress.tensors, prior)
     floats = {k: mi.Float(tensors[k]) for k in ("illumination", "z_l")}
     tensors["lobes"] = decode_lobes(prior, floats).numpy()
     reached = [stage for _, stage in settings.stages[: progress.stage + 1]]
@@ -298,7 +303,7 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     write_png(out / "input.png", output.preview("final", portrait.image, portrait.mask))
     output.write_scene(out / "scene.xml", portrait.camera)
 
-    scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel)
+    scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
     layers = output.render_layers(scene)
     with contextlib.suppress(FileExistsError):
         (out / "renders").mkdir()
@@ -316,6 +321,8 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
 
     inside = portrait.mask * (layers["mask"] > 0.99)
     report["psnr_inside_mask_db"] = round(output.psnr_inside(layers["final"], portrait.image, inside), 2)
+    eq_8 = layers["diffuse"] + layers["specular"]
+    report["psnr_of_unrefined_light_db"] = round(output.psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
     report["seconds"]["output"] = round(time.monotonic() - begun, 2)
     report["seconds"]["total"] = round(time.monotonic() - started, 2)

@@ -62,14 +62,21 @@ def render_radiance(scene: mi.Scene) -> np.ndarray:
 
 
 def avatar_scene(
-    avatar_path: str, camera: Camera, lobes: np.ndarray, voxel: float, extra_channels: bool = True
+    avatar_path: str,
+    camera: Camera,
+    lobes: np.ndarray,
+    voxel: float,
+    extra_channels: bool = True,
+    in_photo: bool = False,
 ) -> mi.Scene:
     """The head of an avatar file before a black background, closed-form shading, `lobes` [N_l, 7] as its light; evenly
-    spread samples in each pixel, against jagged outlines. `extra_channels` are those of `LAYERS` but the radiance."""
+    spread samples in each pixel, against jagged outlines. `extra_channels` are those of `LAYERS` but the radiance.
+    `in_photo`: the lobes are the avatar's own, and its refinement of that light is in the radiance."""
+    refinement = {"light_refinement": avatar_path} if in_photo else {}
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "sira_sg", "hide_emitters": True, "aovs": extra_channels},
+            "integrator": {"type": "sira_sg", "hide_emitters": True, "aovs": extra_channels, **refinement},
             "sensor": sensor(camera, {"type": "stratified", "sample_count": _SAMPLES}),
             "head": head(avatar_path, voxel),
             "light": {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)},

@@ -53,7 +53,7 @@ class PolishProblem:
         self.regular = AppearanceProblem(portrait, avatar, avatar_path, settings)
         self.scene, self.target, self.share = polish_scene(portrait, avatar_path, settings)
         self.parameters = mi.traverse(self.scene)
-        self.detail = albedo_detail(self.scene)
+        self.detail = picture_detail(self.scene, avatar_path)
         shape = self.scene.shapes()[0]
         self.x_ref, self.gamma = evaluate_in_chunks(lambda x: deform(shape.field(), x), shape.vertices())
         self.jitter = 0.5 * shape.voxel
@@ -175,14 +175,16 @@ def polish_scene(portrait: Portrait, avatar_path: str | Path, settings: FitSetti
     return scene, np.ascontiguousarray(photo, np.float32), weight.astype(np.float32)
 
 
-def albedo_detail(scene: mi.Scene) -> np.ndarray:
-    """What the mesh is too coarse for: the networks' diffuse albedo over that between vertices, by pixel [h, w, 3]."""
-    first, _ = LAYERS["diffuse_albedo"]
-    exact, baked = (
-        mi.render(scene, integrator=mi.load_dict(integrator), spp=16, seed=0).numpy()[..., start : start + 3]
-        for integrator, start in (({"type": "sira_sg"}, first), ({"type": "aov", "aovs": "albedo:albedo"}, 0))
-    )
-    return np.clip((exact + _DARK) / (baked + _DARK), 0.5, 2.0).astype(np.float32)
+def picture_detail(scene: mi.Scene, avatar_path: str | Path) -> np.ndarray:
+    """What the path-traced picture is multiplied by, by pixel [h, w, 3]: where the mesh is too coarse for the albedo,
+    the networks' diffuse albedo over that between vertices; and the refinement of the avatar's light."""
+    closed_form = {"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)}
+    exact = mi.render(scene, integrator=mi.load_dict(closed_form), spp=16, seed=0).numpy()
+    baked = mi.render(scene, integrator=mi.load_dict({"type": "aov", "aovs": "albedo:albedo"}), spp=16, seed=0).numpy()
+    channels = {name: exact[..., start : start + count] for name, (start, count) in LAYERS.items()}
+    albedo = np.clip((channels["diffuse_albedo"] + _DARK) / (baked[..., :3] + _DARK), 0.5, 2.0)
+    light = (channels["final"] + _DARK) / (channels["diffuse"] + channels["specular"] + _DARK)
+    return (albedo * light).astype(np.float32)
 
 
 def before_polish(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -197,8 +199,9 @@ def polish_gain(
     """PSNR in dB of the head's pictures against the photo before and after the polish, in the size of the polish:
     `path_traced_psnr_db` and `closed_form_psnr_db`."""
     scene, photo, weight = polish_scene(portrait, avatar_path, settings)
-    closed_form = mi.load_dict({"type": "sira_sg", "hide_emitters": True})
-    pictures = ("path_traced", scene.integrator(), albedo_detail(scene)), ("closed_form", closed_form, 1.0)
+    closed_form = mi.load_dict({"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)})
+    detail = picture_detail(scene, avatar_path)
+    pictures = ("path_traced", scene.integrator(), detail), ("closed_form", closed_form, 1.0)
     parameters = mi.traverse(scene)
     gain: dict[str, list[float]] = {f"{name}_psnr_db": [] for name, _, _ in pictures}
     for state in (before_polish(tensors), tensors):

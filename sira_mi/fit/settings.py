@@ -40,6 +40,7 @@ class AppearanceWeights:
     embedding: float = 1e-5  # on ‖z‖²
     white_light: float = 0.005  # mean squared log-chroma of the lobes: the prior on the light's colour
     skin_tone: float = 2e-2  # on the deviation of the skin's albedo from the expected tone, in standard deviations
+    shares: float = 0.05  # on the distance of albedo's and light's parts of the residual from their shares
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
 
 
@@ -128,7 +129,7 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
             Stage(
                 "refinement",
                 round(800 * refinement),
-                {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3},
+                {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3, "light_refinement": 5e-3},
                 k_s=(1.0, 1.0),
                 k_r=1.0,
             ),
@@ -166,7 +167,7 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 
 QUALITIES = {
-    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.7, 0.35)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0, 1.0)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5, 2.5)),
+    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.7, 0.25)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0, 0.75)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5, 2.0)),
 }

@@ -26,6 +26,8 @@ LANDMARKS = 468
 PRIOR = Path(__file__).with_name("prior.safetensors")
 _MAXIMUM_BYTES = 64 << 20
 _MAXIMUM_LOBES = 4096
+# Networks that an avatar may lack.
+OPTIONAL = {"light_refinement"}
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,9 @@ class AvatarArchitecture:
                 self.specular_latent,
             ),
             "albedo_refinement": Architecture(
+                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
+            ),
+            "light_refinement": Architecture(
                 encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
             ),
             "illumination": Architecture(
@@ -201,6 +206,8 @@ def _check(avatar: Avatar) -> None:
     due |= {"lobes": (*tensors["lobes"].shape[:1], 7), "landmarks": (LANDMARKS, 3)}
     if not 0 < tensors["lobes"].size <= 7 * _MAXIMUM_LOBES:
         raise ValueError(f"between 1 and {_MAXIMUM_LOBES} lobes expected")
+    for name in OPTIONAL - set(tensors):
+        del due[name]
     for name, shape in due.items():
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.float32:

@@ -119,7 +119,7 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
 
     camera = with_pose(portrait, progress.tensors).camera
     lobes = avatar.tensors["lobes"]
-    scene = output.avatar_scene(str(folder / "avatar.safetensors"), camera, lobes, settings.final_voxel)
+    scene = output.avatar_scene(str(folder / "avatar.safetensors"), camera, lobes, settings.final_voxel, in_photo=True)
     layers, head = output.render_layers(scene), scene.shapes()[0]
     shown = (linear_to_srgb(portrait.image), linear_to_srgb(layers["final"]), 0.5 + 0.5 * layers["normal"])
     write_png(picture, np.concatenate(shown, axis=1))

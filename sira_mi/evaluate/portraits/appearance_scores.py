@@ -30,19 +30,20 @@ class PredictedAppearance:
     diffuse_albedo: np.ndarray  # [H, W, 3]
     specular_albedo: np.ndarray  # [H, W] reflectance at normal incidence
     mask: np.ndarray  # [H, W] coverage, 0 to 1
+    shaded: np.ndarray  # [H, W, 3] radiance of eq. 8: `final` without the refinement of the light
 
 
 def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str, float]:
     """All appearance scores of a prediction.
 
-    `final_`, `diffuse_`, `diffuse_scaled_`, `specular_` and `specular_scaled_` `psnr` (dB) and `ssim`;
+    `final_`, `shaded_`, `diffuse_`, `diffuse_scaled_`, `specular_` and `specular_scaled_` `psnr` (dB) and `ssim`;
     `skin_ciede2000_mean`, `_median`, and after the scale of the skin's own pixels `skin_scaled_ciede2000_mean`,
     `_median`; the scores of `leakage_scores`. Counts: `pixels` compared and `skin_pixels` of them; `lost_pixels`, that
-    only the truth covers; `final_`, `diffuse_` and `specular_nonfinite`, predicted values among those compared that are
-    NaN or infinite: they count as black. Without pixels the scores are NaN. Raises InputError for images that are not
-    of the photo's size."""
+    only the truth covers; `final_`, `shaded_`, `diffuse_` and `specular_nonfinite`, predicted values among those
+    compared that are NaN or infinite: they count as black. Without pixels the scores are NaN. Raises InputError for
+    images that are not of the photo's size."""
     height, width = truth.mask.shape
-    for name, channels in (("final", 3), ("diffuse_albedo", 3), ("specular_albedo", 1)):
+    for name, channels in (("final", 3), ("shaded", 3), ("diffuse_albedo", 3), ("specular_albedo", 1)):
         shape = (height, width, 3)[: 2 + (channels > 1)]
         check_array(f"the prediction's {name}", getattr(prediction, name), shape, finite=False)
     check_array("the prediction's mask", prediction.mask, (height, width))
@@ -57,6 +58,7 @@ def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str,
     }
     pairs = {
         "final": (prediction.final, truth.image),
+        "shaded": (prediction.shaded, truth.image),
         "diffuse": (prediction.diffuse_albedo, truth.diffuse_albedo),
         "specular": (prediction.specular_albedo / F0_OF_STRENGTH, truth.specular_albedo / F0_OF_STRENGTH),
     }
@@ -65,7 +67,7 @@ def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str,
         scores[f"{name}_nonfinite"] = float((~finite)[inside].sum())
         values = np.where(finite, values, 0).astype(np.float64)
         scores |= image_scores(f"{name}_", values, true, inside)
-        if name != "final":
+        if name in ("diffuse", "specular"):
             scores |= image_scores(f"{name}_scaled_", _scaled_inside(values, true, inside), true, inside)
         if name == "diffuse":
             albedo = values[skin]

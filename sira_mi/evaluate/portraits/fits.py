@@ -138,7 +138,8 @@ def _read_head(out: Path, shaded: bool, truth: Truth) -> tuple[PredictedHead, Pr
     if not shaded:
         return head, None
     names = ("final", "diffuse_albedo", "specular_albedo", "mask")
-    return head, PredictedAppearance(**{name: image[name] for name in names})
+    shaded = image["diffuse"] + image["specular"]
+    return head, PredictedAppearance(**{name: image[name] for name in names}, shaded=shaded)
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:

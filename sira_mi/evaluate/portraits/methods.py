@@ -2,8 +2,9 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all on the geometry of a.4: b.1 has no prior, b.2 the AF-SM and its
-schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish after b.3, and b.6 is
-b.3 without shadows: all light of the upper hemisphere arrives at every point.
+schedule, b.3 is the fit as it ships, with the refinement, b.4 adds a relief stage, b.5 a polish after b.3, b.6 is
+b.3 without shadows: all light of the upper hemisphere arrives at every point, and b.7 gives all that base albedo and
+light leave of the photo to the albedo, as the paper does.
 """
 
 from collections.abc import Callable
@@ -94,6 +95,14 @@ def _without_refinement(shipped: Stages) -> Stages:
     return tuple((kind, stage) for kind, stage in _of_kind(APPEARANCE)(shipped) if stage.k_r == 0)
 
 
+def _all_to_the_albedo(shipped: Stages) -> Stages:
+    """The refinement of eq. 11 alone: that of the light stays 1."""
+    return tuple(
+        (kind, replace(stage, rates={k: v for k, v in stage.rates.items() if k != "light_refinement"}))
+        for kind, stage in _of_kind(APPEARANCE)(shipped)
+    )
+
+
 METHODS = (
     Method(
         "a.1",
@@ -122,5 +131,6 @@ METHODS = (
     Method("b.4", "with a relief stage", _with_relief, _unchanged, after="a.4"),
     Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
     Method("b.6", "as b.3, without shadows", _of_kind(APPEARANCE), _unchanged, after="a.4", shadows=False),
+    Method("b.7", "as b.3, all of the residual to the albedo", _all_to_the_albedo, _unchanged, after="a.4"),
 )
 BY_NAME = {method.name: method for method in METHODS}

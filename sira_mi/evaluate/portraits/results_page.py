@@ -16,7 +16,7 @@ from sira_mi.fit import output
 SHIPPED = "b.3"
 GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", "b.4")
 FIT_ROWS = (MEAN_HEAD, "a.4", SHIPPED)  # of the shipped fit's geometry, as a.4 and b.3 leave it
-APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5", "b.6")
+APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5", "b.6", "b.7")
 _TILE = 256  # pixels, side of a picture in the sheet
 _SHEET_PORTRAITS = 6
 AT_MOST, AT_LEAST = "≤", "≥"
@@ -46,6 +46,7 @@ GEOMETRY_COLUMNS = (
 APPEARANCE_COLUMNS = (
     Column("final, dB", "final_psnr", 1),
     Column("SSIM", "final_ssim"),
+    Column("eq. 8, dB", "shaded_psnr", 1),
     Column("diffuse, dB", "diffuse_psnr", 1),
     Column("SSIM", "diffuse_ssim"),
     Column("scaled, dB", "diffuse_scaled_psnr", 1),
@@ -142,6 +143,7 @@ MARKS = (
     Mark("silhouette IoU", AT_LEAST, 0.97, _shipped("silhouette_iou"), 3),
     Mark("final render, dB", AT_LEAST, 34, _shipped("final_psnr"), 1),
     Mark("final render, SSIM", AT_LEAST, 0.95, _shipped("final_ssim"), 3),
+    Mark("the same without the light's refinement, dB", AT_LEAST, 34, _shipped("shaded_psnr"), 1),
     Mark("diffuse albedo, dB", AT_LEAST, 23, _shipped("diffuse_psnr"), 1),
     Mark("diffuse albedo, SSIM", AT_LEAST, 0.88, _shipped("diffuse_ssim"), 3),
     Mark("specular albedo, dB", AT_LEAST, 19.5, _shipped("specular_psnr"), 1),
@@ -235,10 +237,10 @@ def _by_portrait(methods: dict) -> str:
                     row["portrait"],
                     number(mean_head["h3ds_face_mean"]),
                     *(number(scores[c.score], c.digits) for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]),
-                    *(number(scores[c.score], c.digits) for c in APPEARANCE_COLUMNS[:7]),
+                    *(number(scores[c.score], c.digits) for c in APPEARANCE_COLUMNS[:8]),
                 ]
             )
-    titles = [c.title for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]] + [c.title for c in APPEARANCE_COLUMNS[:7]]
+    titles = [c.title for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]] + [c.title for c in APPEARANCE_COLUMNS[:8]]
     return table(("b.3", "mean head", *titles), lines)
 
 
