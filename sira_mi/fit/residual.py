@@ -57,7 +57,9 @@ def squares(residual: np.ndarray) -> np.ndarray:
     return np.stack([np.square(grey), np.square(residual - grey).sum(axis=0)])
 
 
-def light_variances(radiance: Callable[[PhotoPoints], np.ndarray], points: PhotoPoints, chosen: np.ndarray, seed: int):
+def light_variances(
+    radiance: Callable[[PhotoPoints], np.ndarray], points: PhotoPoints, chosen: np.ndarray, seed: int
+) -> np.ndarray:
     """Variances [2, N] (grey, colour) of the log light at all `points`, from its changes at the `chosen` ones when
     normals tilt and shadows shift. `radiance` gives eq. 8 [3, n] at the chosen points, whose normals and visibility may
     be others."""

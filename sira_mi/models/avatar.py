@@ -131,8 +131,8 @@ def signed_distance_field(architecture: AvatarArchitecture, deformation, referen
 @dataclass(frozen=True)
 class Avatar:
     """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
-    architecture; `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light; `landmarks` [468, 3], the face
-    landmarks of the mean head in scene units (NaN where unknown)."""
+    architecture (`light_refinement` may be missing); `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light;
+    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown)."""
 
     architecture: AvatarArchitecture
     tensors: dict[str, np.ndarray]

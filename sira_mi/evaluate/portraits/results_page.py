@@ -287,14 +287,15 @@ def _tile(image: np.ndarray) -> np.ndarray:
 
 _ABLATIONS_TEXT = """## Ablations
 
-The methods of the paper's Figure 4 and three of this project, all at `{quality}` quality. a.1 and a.2 fit a field
+The methods of the paper's Figure 4 and four of this project, all at `{quality}` quality. a.1 and a.2 fit a field
 without deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves
 the deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was
-learned with the shapes, is the fit's geometry. b.1 to b.6 go on from a.4: b.1 with untrained decoders, b.2 without the
-refinement, b.3 as shipped at that quality, b.4 with a relief stage before the refinement (shape from shading, which
-moves the surface too; no quality ships with it), b.5 polished by path tracing, b.6 as b.3 but with all
-light of the upper hemisphere at every point: no shadows, and no light that the head reflects onto itself. A method
-without a row was left out by `--methods`.
+learned with the shapes, is the fit's geometry. b.1 to b.7 go on from a.4: b.1 with untrained decoders, b.2 without
+the refinement, b.3 as shipped at that quality, b.4 with a relief stage before the refinement (shape from shading,
+which moves the surface too; no quality ships with it), b.5 polished by path tracing, b.6 as b.3 but with all light of
+the upper hemisphere at every point: no shadows, and no light that the head reflects onto itself. b.7 is b.3 as the
+paper has it, without a refinement of the light: all that base albedo and light leave of the photo goes to the albedo.
+A method without a row was left out by `--methods`.
 
 """
 
@@ -331,16 +332,21 @@ strict (23.9 dB); at `draft` twice the steps for light, albedo and speculars (24
   of the skin or of the lit part of the face, alone or together, tells the level hardly: the 97th percentile of the
   face follows the true level with correlation 0.85 on these 12 portraits and with 0.42 on 78 of training heads. The
   colour of the eyes' white says little more of the skin's colour than its level does (log of red over green within
-  0.127 instead of 0.129); twice the width for that colour: no difference. The rest is what the refinement takes for
-  albedo from light and normals (b.3 after b.2). Two and eight times its shipped weight of eq. 12: diffuse albedo 20.5
-  → 21.0 → 22.1 dB, final render 32.8 → 32.4 → 29.5 (with the skin's level by brightness; the first figures are of
+  0.127 instead of 0.129); twice the width for that colour: no difference. The albedo's latent optimised with the light
+  from the first stage on: 24.3 → 24.4 dB before the refinement. Half of the points of light, albedo and speculars drawn
+  from the face: 24.3 → 24.5 dB before the refinement and 23.5 → 24.2 on skin alone.
+- **The refinement** (with all of the residual given to the albedo, b.7, unless said). Two and eight times its shipped
+  weight of eq. 12: diffuse albedo 20.5 → 21.0 → 22.1 dB, final render 32.8 → 32.4 → 29.5 (the first figures are of
   half the shipped weight). Four and sixteen times λ8 of eq. 13, its weight in shadows: 22.1 → 22.7 → 23.4 dB, final
   render 32.7 → 31.7 → 29.1. The skin's tone asked of the refined albedo instead of the base: 22.1 → 23.2 dB, final
-  render 32.7 → 30.1, with five times the light's learning rates 22.9 and 30.3. The smooth grey part of what b.2
-  leaves of the photo, taken out of it before the refinement: 0.3 dB of the scaled albedo for 1.2 dB of the final
-  render. The albedo's latent optimised with the light from the first stage on: 24.3 → 24.4 dB before the refinement.
-  Half of the points of light, albedo and speculars drawn from the face: 24.3 → 24.5 dB before the refinement and 23.5
-  → 24.2 on skin alone; after the refinement the two, these points and twice the steps, have come from 22.1 to 22.6."""
+  render 32.7 → 30.1. The smooth grey part of what b.2 leaves of the photo, taken out of it before: 0.3 dB of the
+  scaled albedo for 1.2 dB of the final render. What eq. 8 reaches at all, with its light fitted anew: 26 dB by what
+  b.2 finds, 27 by the true albedo, 30 by true albedo and normals, 34 by these and true shadows: the residual is as
+  much the light's as the albedo's. Shared between them it is in the shipped fit: diffuse albedo 22.5 → 24.8 dB
+  (scaled 24.0 → 26.6), final render 32.5 → 33.7. Shares by the size of the residual over the whole photo instead of
+  by the light at each point: 24.4 dB (scaled 26.0), and of the portrait of scikit-image, whose residuals are large,
+  hardly eyes, smile or suit were left. Ten times the weight that holds the parts to their shares: 24.5 dB, final
+  render 30.7."""
 
 _COSTS_TEXT = """Wall-clock time of processes, their start and the writing of scored pictures included; a fit as shipped
 is a.4 and b.3 together. b.1, b.4 and b.6 ran beside other work: alone, a relief stage of half the steps took 9 s."""
@@ -359,10 +365,11 @@ direction is said. `face` is skin and eyes within 95 mm of the nose tip, after s
 shoulders, hair included; `hidden half` is what the photo does not show; IoU leaves out the body below the
 model's floor, 30 cm under the ears. Where b.3 has a relief stage, it moves the surface of a.4."""
 
-_APPEARANCE_TEXT = """Inside the mask, PSNR and SSIM on sRGB values. Specular albedo is the reflectance at normal
-incidence over 0.08; `scaled` is after one least-squares factor a channel; `leakage` is the correlation of the log
-albedo's error on skin with the log of the light, `of shadows` with the share of light that is not shadowed: 0 is
-none."""
+_APPEARANCE_TEXT = """Inside the mask, PSNR and SSIM on sRGB values. `eq. 8` is the final render without the
+[refinement of the light](architecture.md#albedo-or-light), which holds in the photo's own light only: what albedo,
+light and shape explain by themselves. Specular albedo is the reflectance at normal incidence over 0.08; `scaled` is
+after one least-squares factor a channel; `leakage` is the correlation of the log albedo's error on skin with the log
+of the light, `of shadows` with the share of light that is not shadowed: 0 is none."""
 
 _PICTURE_TEXT = """## Pictures
 
