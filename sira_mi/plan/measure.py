@@ -88,8 +88,10 @@ def _alone(picture: Callable[..., np.ndarray], head) -> tuple[np.ndarray, np.nda
 
 def measured_fit(plan: Plan, problem, settings: FitSettings, tensors: dict[str, np.ndarray]) -> Plan:
     """The plan with the error and the time saved of all that it leaves out of the stages of an `AppearanceProblem`, at
-    the avatar tensors `tensors`."""
+    the avatar tensors `tensors`, and where these have none, at what a stage starts from."""
     stages = {stage.name: stage for kind, stage in settings.stages if kind == APPEARANCE}
+    for stage in stages.values():
+        tensors = {**problem.start(stage, tensors), **tensors}
     problem.refresh(tensors)
 
     def gradient(stage: Stage, chosen: Plan) -> np.ndarray:
