@@ -345,13 +345,14 @@ strict (23.9 dB); at `draft` twice the steps for light, albedo and speculars (24
   scaled albedo for 1.2 dB of the final render. What eq. 8 reaches at all, with its light fitted anew: 26 dB by what
   b.2 finds, 27 by the true albedo, 30 by true albedo and normals, 34 by these and true shadows: the residual is as
   much the light's as the albedo's. Shared between them it is in the shipped fit: diffuse albedo 22.5 → 24.8 dB
-  (scaled 24.0 → 26.6), final render 32.5 → 33.7. Shares by the size of the residual over the whole photo instead of
-  by the light at each point: 24.4 dB (scaled 26.0), and of the portrait of scikit-image, whose residuals are large,
-  hardly eyes, smile or suit were left. Ten times the weight that holds the parts to their shares: 24.5 dB, final
-  render 30.7."""
+  (scaled 24.0 → 26.6), final render 32.5 → 33.7 by 280 steps, 24.7 (26.5) and 32.3 by the 200 of the shipped draft.
+  Shares by the size of the residual over the whole photo instead of by the light at each point: 24.4 dB (scaled
+  26.0), and of the portrait of scikit-image, whose residuals are large, hardly eyes, smile or suit were left. Six
+  times the weight that holds the parts to their shares: 24.5 dB with these, final render 30.7."""
 
 _COSTS_TEXT = """Wall-clock time of processes, their start and the writing of scored pictures included; a fit as shipped
-is a.4 and b.3 together. b.1 and b.6 ran beside other work."""
+is a.4 and b.3 together. b.1 and b.6 ran beside other work,
+as did two fits each of b.5 and b.7."""
 
 _INTRODUCTION = """# Results of the single-image fit
 
