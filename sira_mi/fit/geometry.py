@@ -1,5 +1,6 @@
-"""The geometry stages of section 3.2.1: latents first, then deformation and rendering networks; the reference SDF
-stays as it is. The head's pose, estimated from landmarks of the mean head, is optimised along.
+"""The geometry stages of section 3.2.1: latents first, then the deformation network too; the reference SDF stays as it
+is. The head's pose, estimated from landmarks of the mean head, is optimised along, and so is, other than in the paper,
+the rendering network from the first stage on.
 
 Colour and mask losses go through the `sira_radiance` integrator, one sample a ray; eikonal, landmark and regularising
 terms are evaluated on the field."""
@@ -48,7 +49,7 @@ class GeometryProblem:
         self.head.remesh_every = 1 << 30
         mask = np.where(self.valid, portrait.mask, 0)
         # An untrained rendering function expects no exposure.
-        self.exposure = 1.0 if "rendering" in settings.stages[0][1].rates else face_exposure(portrait)
+        self.exposure = face_exposure(portrait) if settings.learned_radiance else 1.0
         self.target = np.concatenate([self.exposure * portrait.image, mask[..., None]], axis=-1).astype(np.float32)
         self.landmarks = self._landmarks(avatar)
 
@@ -121,7 +122,7 @@ class GeometryProblem:
         color, mask = self._image_losses(tensors, stage, step, rng)
         _, gradient, _, _ = surface(field, self._eikonal_points(rng))
         terms = {
-            "color": weights.color * color,
+            "color": weights.color * stage.color * color,
             "mask": weights.mask * mask,
             "eikonal": weights.eikonal * losses.eikonal_loss(gradient),
             "embedding": weights.embedding * (_square(current["z_sdf"]) + _square(current["z_r"])),

@@ -13,6 +13,7 @@ class Stage:
     steps: int
     rates: dict[str, float]  # learning rate of every optimised avatar tensor; all others are frozen
     mask_sharpness: float = 50.0  # α of the mask loss, per scene unit (IDR: 50 doubling to 1600 on a unit sphere)
+    color: float = 1.0  # of the weight of the geometry's colour
     landmark: float = 1.0  # of the weight of the landmarks: the photo itself is the better judge once the head is near
     k_s: tuple[float, float] = (0.0, 0.0)  # weight of the specular BRDF, first and last step, eq. 8
     k_r: float = 0.0  # weight of the albedo refinement, eq. 11
@@ -26,7 +27,7 @@ class GeometryWeights:
     mask: float = 2.0  # on a mean over rays, in scene units
     eikonal: float = 0.05
     landmark: float = 0.4  # on reprojection errors in face sizes
-    embedding: float = 6e-6  # on ‖z‖², keeps latents where the prior was trained
+    embedding: float = 6e-5  # on ‖z‖², keeps latents where the prior was trained
     stay: float = 0.5  # on mean |δ − δ₀| against the prior's deformation network
 
 
@@ -78,6 +79,7 @@ class FitSettings:
     appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
     relief: ReliefWeights = field(default_factory=ReliefWeights)
     polish: PolishSettings = field(default_factory=PolishSettings)
+    learned_radiance: bool = True  # the rendering function starts as the SA-SM has it, at the exposure of its photos
     shadows: bool = True  # of the head on itself, and light that it reflects onto itself, in the appearance stages
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
@@ -85,7 +87,8 @@ class FitSettings:
 def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tuple[str, Stage], ...]:
     """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the scales of the geometry stages, of light,
     albedo and speculars, and of the refinement. Geometry that is fitted for longer follows the photo further from the
-    prior, on some heads away from the person."""
+    prior, on some heads away from the person. The rendering function moves from the first step on: one that cannot take
+    the photo's own light puts it down to the shape."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)
@@ -95,7 +98,16 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
 
     shape, networks = ("z_sdf", "z_r"), ("deformation", "rendering")
     return (
-        (GEOMETRY, Stage("latents", shape_steps(160), {"z_sdf": 6e-2, "z_r": 6e-2, "pose": 3e-3}, mask_sharpness=30)),
+        (
+            GEOMETRY,
+            Stage(
+                "latents",
+                shape_steps(160),
+                _rates(shape, 6e-2, ("rendering",), 1e-3, 3e-3),
+                mask_sharpness=30,
+                color=0.3,
+            ),
+        ),
         (
             GEOMETRY,
             Stage(

@@ -32,12 +32,19 @@ class Method:
     deforms: bool = True  # which prior: the shipped one, or the field without deformation
     after: str | None = None  # the method whose result it goes on from
     shadows: bool = True
+    learned_radiance: bool = True  # its rendering function starts as the SA-SM has it
 
     def settings(self, settings: FitSettings) -> FitSettings:
         """The settings of a fit by this method at the quality of `settings`. Nothing ties δ to a prior where there is
         none."""
         geometry = settings.geometry if self.deforms else replace(settings.geometry, stay=0.0)
-        return replace(settings, stages=self.stages(settings.stages), geometry=geometry, shadows=self.shadows)
+        return replace(
+            settings,
+            stages=self.stages(settings.stages),
+            geometry=geometry,
+            shadows=self.shadows,
+            learned_radiance=self.learned_radiance,
+        )
 
 
 def _of_kind(kind: str) -> Callable[[Stages], Stages]:
@@ -63,8 +70,8 @@ def _untrained_appearance(prior: Avatar, tensors: Tensors, seed: int) -> Tensors
 
 
 def _rendering_from_scratch(moved: dict[str, str | None]) -> Callable[[Stages], Stages]:
-    """The geometry stages with the rendering function optimised from the first on; `moved` says for every other tensor
-    at whose rate it is optimised, None for not at all."""
+    """The geometry stages with the rendering function, untrained before, optimised fast from the first on; `moved` says
+    for every other tensor at whose rate it is optimised, None for not at all."""
 
     def stages(shipped: Stages) -> Stages:
         result = []
@@ -110,6 +117,7 @@ METHODS = (
         _rendering_from_scratch({}),
         _untrained_rendering,
         deforms=False,
+        learned_radiance=False,
     ),
     Method(
         "a.2",
@@ -117,12 +125,14 @@ METHODS = (
         _rendering_from_scratch({"deformation": "deformation", "reference": "deformation"}),
         _untrained_rendering,
         deforms=False,
+        learned_radiance=False,
     ),
     Method(
         "a.3",
         "deformation and reference",
         _rendering_from_scratch({"deformation": "deformation"}),
         _untrained_rendering,
+        learned_radiance=False,
     ),
     Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
