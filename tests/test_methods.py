@@ -41,6 +41,8 @@ def test_ablations_are_those_of_the_paper():
     assert moved("b.5") == {"z_l", "illumination", "z_s", "albedo_refinement"}
     assert moved("b.3") - moved("b.7") == {"light_refinement"} and moved("b.6") == moved("b.3")
     assert [kind for kind, _ in BY_NAME["b.4"].settings(DRAFT).stages].count(RELIEF) == 1
+    learned = {name: BY_NAME[name].settings(DRAFT).learned_radiance for name in ("a.1", "a.2", "a.3", "a.4")}
+    assert learned == {"a.1": False, "a.2": False, "a.3": False, "a.4": True}
     assert not BY_NAME["a.1"].deforms and BY_NAME["a.2"].settings(DRAFT).geometry.stay == 0
 
 

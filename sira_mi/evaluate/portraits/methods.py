@@ -32,7 +32,6 @@ class Method:
     deforms: bool = True  # which prior: the shipped one, or the field without deformation
     after: str | None = None  # the method whose result it goes on from
     shadows: bool = True
-    learned_radiance: bool = True  # its rendering function starts as the SA-SM has it
 
     def settings(self, settings: FitSettings) -> FitSettings:
         """The settings of a fit by this method at the quality of `settings`. Nothing ties δ to a prior where there is
@@ -43,7 +42,7 @@ class Method:
             stages=self.stages(settings.stages),
             geometry=geometry,
             shadows=self.shadows,
-            learned_radiance=self.learned_radiance,
+            learned_radiance=self.start is not _untrained_rendering,
         )
 
 
@@ -117,7 +116,6 @@ METHODS = (
         _rendering_from_scratch({}),
         _untrained_rendering,
         deforms=False,
-        learned_radiance=False,
     ),
     Method(
         "a.2",
@@ -125,14 +123,12 @@ METHODS = (
         _rendering_from_scratch({"deformation": "deformation", "reference": "deformation"}),
         _untrained_rendering,
         deforms=False,
-        learned_radiance=False,
     ),
     Method(
         "a.3",
         "deformation and reference",
         _rendering_from_scratch({"deformation": "deformation"}),
         _untrained_rendering,
-        learned_radiance=False,
     ),
     Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
