@@ -164,7 +164,7 @@ def test_components_of_a_mesh(centres, parts):
 
 def test_a_fit_recovers_the_models_own_heads(model, own):
     scans, _ = own
-    w = shape_prior.fit_shape(model, scans, ShapeFit(steps=200))
+    w = shape_prior.fit_shape(model, [scan.scene for scan in scans], ShapeFit(steps=200))
     errors = {}
     for name, latents in (("fitted", w), ("mean", 0 * w)):
         fields = [model.field(model.latent("z_sdf", latents[:, k])) for k in range(3)]
@@ -176,7 +176,7 @@ def test_a_fit_recovers_the_models_own_heads(model, own):
 
 
 def test_a_fit_repeats_bit_for_bit(model, own):
-    fits = [shape_prior.fit_shape(model, own[0], ShapeFit(steps=5), seed=3) for _ in range(2)]
+    fits = [shape_prior.fit_shape(model, [scan.scene for scan in own[0]], ShapeFit(steps=5), seed=3) for _ in range(2)]
     np.testing.assert_array_equal(*fits)
     assert np.abs(fits[0]).max() > 0
 

@@ -27,7 +27,7 @@ def problem(variant, avatar, avatar_path):
 
     whole = np.ones((32, 32), np.float32)
     nowhere = np.full((468, 2), np.nan)
-    photo = Portrait(np.zeros((32, 32, 3), np.float32), whole, nowhere, camera(focal=40, size=32), ())
+    photo = Portrait(np.zeros((32, 32, 3), np.float32), whole, nowhere, nowhere, camera(focal=40, size=32), ())
     problem = PolishProblem(photo, avatar, avatar_path, BLOB)
     problem.target = picture(problem, avatar.tensors)
     return problem

@@ -32,7 +32,7 @@ def portrait():
     image[top : bottom + 1, left : right + 1] = USUAL
     for column, row in landmarks[list(EYES)]:
         image[int(row) - 1 : int(row) + 2, int(column) - 1 : int(column) + 2] = 2 * USUAL
-    return Portrait(image, np.ones((SIZE, SIZE), np.float32), landmarks, view, ())
+    return Portrait(image, np.ones((SIZE, SIZE), np.float32), landmarks, landmarks, view, ())
 
 
 def darker(portrait: Portrait, factor: float) -> Portrait:

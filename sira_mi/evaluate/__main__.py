@@ -1,11 +1,13 @@
-"""`python -m sira_mi.evaluate prior|sizes|benchmark|skin|fits …`: measures the priors, builds the benchmark, fits it.
+"""`python -m sira_mi.evaluate prior|sizes|benchmark|skin|landmarks|fits …`: measures priors and fits on a benchmark.
 
 `prior` measures the prior of a run on the collection's test split, trains and measures the ablations, and writes
 `docs/priors.md` and its pictures; `sizes` trains and measures networks of several sizes for a table on that page.
 Results are kept in RUNS/evidence, so that only what has changed is measured again. `benchmark` photographs test heads
 of the collection under known light; portraits that are there already are kept. `skin` measures on such portraits, of
-training heads, what brightness of skin and eyes tell of the skin's albedo: the constants of `sira_mi.fit.skin`. `fits`
-fits and scores the benchmark's portraits and writes `docs/results.md`.
+training heads, what brightness of skin and eyes tell of the skin's albedo: the constants of `sira_mi.fit.skin`.
+`landmarks` measures on them, and on the collection's training scans, where landmarks of found faces and of the prior's
+heads are off, and writes both corrections. `fits` fits and scores the benchmark's portraits and writes
+`docs/results.md`.
 """
 
 import argparse
@@ -37,7 +39,7 @@ def main() -> None:
     portraits.add_argument("--sources", nargs="+", metavar="NAME", help="use these sources only, of the collection's")
     portraits.add_argument("--primary", action="store_true", help="one light of each head instead of three")
     portraits.add_argument(
-        "--split", choices=("test", "train"), default="test", help="train: for `skin`, not for scores"
+        "--split", choices=("test", "train"), default="test", help="train: for `skin` and `landmarks`, not for scores"
     )
     portraits.add_argument("--heads", type=int, default=12, metavar="N", help="how many heads (default: 12)")
     portraits.add_argument("--size", type=int, default=512, metavar="N", help="of a photo, pixels (default: 512)")
@@ -46,6 +48,14 @@ def main() -> None:
     skin = commands.add_parser("skin", help="measure what photos tell of the level of their skin's albedo")
     skin.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
     skin.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    landmarks = commands.add_parser("landmarks", help="measure and correct landmarks of photos and of the prior")
+    landmarks.add_argument("--collection", type=Path, required=True, help="whose training scans the prior is fitted to")
+    landmarks.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
+    landmarks.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
+    landmarks.add_argument(
+        "--out", type=Path, required=True, help="folder for prior.safetensors and head_landmarks.safetensors"
+    )
+    landmarks.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     fits = commands.add_parser("fits", help="fit the benchmark's portraits, score them, write the page")
     fits.add_argument("--benchmark", type=Path, required=True)
     fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
@@ -67,6 +77,8 @@ def main() -> None:
         return make_benchmark(arguments)
     if arguments.command == "skin":
         return measure_skin(arguments)
+    if arguments.command == "landmarks":
+        return correct_landmarks(arguments)
     if arguments.command == "fits":
         return compare_fits(arguments)
     if arguments.steps < 0:
@@ -144,6 +156,40 @@ def measure_skin(arguments: argparse.Namespace) -> None:
     for title, found in estimates.items():
         values = ", ".join(f"{value:.2f}" for value in found.coefficients)
         print(f"by {title}: {values}; error {found.error:.2f}")
+
+
+def correct_landmarks(arguments: argparse.Namespace) -> None:
+    """Writes the correction of found faces and the prior with its model of landmarks; prints what each mends."""
+    import mitsuba as mi
+
+    mi.set_variant(arguments.variant)
+    from sira_mi.evaluate.portraits import landmark_errors
+    from sira_mi.evaluate.priors import landmark_places
+    from sira_mi.models.avatar import load_avatar, save_avatar
+    from sira_mi.models.scenes import load_training_scenes
+    from sira_mi.portrait.head_landmarks import CORRECTION
+
+    prior = landmark_places.bare(load_avatar(arguments.prior))
+    observations, blind = landmark_errors.observe(arguments.benchmark)
+    found, corrected = landmark_errors.held_out_errors(observations)
+    places = landmark_places.places(prior, load_training_scenes(arguments.collection))
+    placed, modelled = landmark_places.held_out_errors(prior, places)
+    make_folder(arguments.out)
+    landmark_errors.fitted_correction(observations).save(arguments.out / CORRECTION.name)
+    save_avatar(arguments.out / "prior.safetensors", landmark_places.with_landmark_model(prior, places))
+    print(
+        f"{len(observations)} portraits of {len({o.head for o in observations})} heads, {len(blind)} without a face: "
+        f"found landmarks {100 * found:.2f}% of the face off, corrected {100 * corrected:.2f}%"
+    )
+    print(f"{len(places.true)} scans: the prior's landmarks {placed:.1f} mm off, modelled {modelled:.1f} mm")
+
+
+def make_folder(folder: Path) -> None:
+    """Raises InputError when it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder}: {error.strerror}; choose another --out") from error
 
 
 def make_benchmark(arguments: argparse.Namespace) -> None:

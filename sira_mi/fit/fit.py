@@ -32,7 +32,7 @@ from sira_mi.fit.settings import (
     polish_stage,
     without,
 )
-from sira_mi.models.avatar import OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.models.avatar import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
 from sira_mi.plan.decisions import Plan, explain
 from sira_mi.plan.fit import plan_fit
 from sira_mi.portrait.load import linear_to_srgb
@@ -209,6 +209,7 @@ def identify(portrait, settings: FitSettings, seed: int, prior_path: Path) -> st
         portrait.image,
         portrait.mask,
         portrait.landmarks,
+        portrait.head_landmarks,
         portrait.camera.K,
         portrait.camera.world_to_camera,
     ):
@@ -222,10 +223,9 @@ def identify(portrait, settings: FitSettings, seed: int, prior_path: Path) -> st
 def initial_tensors(prior: Avatar, seed: int) -> dict[str, np.ndarray]:
     """The prior's tensors, latents drawn with small variance about the mean (section 3.2.1)."""
     rng = np.random.default_rng([seed, 1 << 20])
-    tensors = dict(prior.tensors)
+    tensors = {name: values for name, values in prior.tensors.items() if name not in {"landmarks", *LANDMARK_MODEL}}
     for name in ("z_sdf", "z_r", "z_a", "z_s"):
         tensors[name] = (tensors[name] + 0.01 * rng.standard_normal(tensors[name].shape)).astype(np.float32)
-    del tensors["landmarks"]
     tensors["pose"] = np.zeros(6, np.float32)
     return tensors
 

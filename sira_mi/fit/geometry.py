@@ -13,12 +13,13 @@ import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_columns
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, rigid_motion, surface
+from sira_mi.fields.sdf import SdfField, deform, rigid_motion, surface
 from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.skin import face_exposure
 from sira_mi.models import losses
 from sira_mi.models.avatar import Avatar, signed_distance_field
+from sira_mi.models.landmark_model import LandmarkModel, placed_landmarks, reference_landmarks
 from sira_mi.portrait.camera import Camera, landmark_weights
 from sira_mi.portrait.portrait import Portrait
 
@@ -30,8 +31,6 @@ _PARAMETERS = {
     "rendering": "integrator.rendering",
     "pose": "head.pose",
 }
-# Fixed-point steps that find a landmark's place from its place in reference space.
-_LANDMARK_STEPS = 4
 _STAY_POINTS = 256
 
 
@@ -78,21 +77,20 @@ class GeometryProblem:
         )
 
     def _landmarks(self, avatar: Avatar) -> dict | None:
-        """Landmarks that both the head and the photo have: places in reference space, pixels, weights."""
-        mean = avatar.tensors["landmarks"]
+        """The landmarks of the mean head [L], those of them that the photo has weighted, the others not."""
         on_head, x_ref = reference_landmarks(avatar)
-        in_photo = np.isfinite(self.portrait.landmarks).all(axis=1)
-        known = on_head & in_photo
-        if known.sum() < 6 or not avatar.architecture.deforms:
+        pixels = self.portrait.head_landmarks[on_head]
+        in_photo = np.isfinite(pixels).all(axis=1)
+        if in_photo.sum() < 6 or not avatar.architecture.deforms:
             return None
-        pixels = self.portrait.landmarks[known].T.astype(np.float32)
-        weights = landmark_weights(len(mean))[known].astype(np.float32)
+        weights = np.where(in_photo, landmark_weights(len(on_head))[on_head], 0).astype(np.float32)
         return {
-            "x_ref": mi.TensorXf(np.ascontiguousarray(x_ref[:, in_photo[on_head]])),
-            "x": mean[known].T.astype(np.float32),
-            "pixels": mi.TensorXf(pixels),
+            "x_ref": mi.TensorXf(np.ascontiguousarray(x_ref)),
+            "x": avatar.tensors["landmarks"][on_head].T.astype(np.float32),
+            "model": LandmarkModel(avatar),
+            "pixels": mi.TensorXf(np.ascontiguousarray(np.nan_to_num(pixels).T, dtype=np.float32)),
             "weights": mi.TensorXf(weights[None] / weights.sum()),
-            "face_size": float(np.ptp(pixels[1])),
+            "face_size": float(np.ptp(pixels[in_photo, 1])),
         }
 
     def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -112,7 +110,7 @@ class GeometryProblem:
         self.parameters.update()
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
-            field = self._field(self._fixed)
+            field = replace(self._field(self._fixed), motion=None)
             self.landmarks["placed"] = placed_landmarks(field, self.landmarks["x_ref"], self.landmarks["x"])
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
@@ -172,13 +170,16 @@ class GeometryProblem:
         return mi.TensorXf(np.ascontiguousarray(np.concatenate([uniform, near]).T, dtype=np.float32))
 
     def _landmark_loss(self, field: SdfField):
-        """Weighted mean reprojection error of the landmarks, in face sizes. A landmark is where the field maps to its
-        place in reference space; one fixed-point step from there carries the derivative."""
+        """Weighted mean reprojection error of the landmarks, in face sizes. One fixed-point step from where they are
+        placed carries the derivative."""
+        unmoved = replace(field, motion=None)
         x = self.landmarks["placed"]
-        x = x - (deform(field, x)[0] - self.landmarks["x_ref"])
+        x = self.landmarks["model"](x - (deform(unmoved, x)[0] - self.landmarks["x_ref"]))
         camera: Camera = self.portrait.camera
         matrix = camera.K @ camera.world_to_camera[:3]
-        projected = mi.TensorXf(matrix[:, :3].astype(np.float32)) @ x + mi.TensorXf(matrix[:, 3:].astype(np.float32))
+        in_world = _inverse(field.motion) @ dr.concat([x, dr.full(mi.TensorXf, 1.0, (1, x.shape[1]))], axis=0)
+        projected = mi.TensorXf(matrix[:, :3].astype(np.float32)) @ in_world
+        projected = projected + mi.TensorXf(matrix[:, 3:].astype(np.float32))
         pixels = projected[0:2, :] / projected[2:3, :]
         offset = (pixels - self.landmarks["pixels"]) / self.landmarks["face_size"]
         length = dr.sqrt(dr.sum(offset * offset, axis=0) + 1e-6)
@@ -198,25 +199,10 @@ class GeometryProblem:
         return losses.mean(dr.abs(deform(field, x)[0] - deform(self._field(prior), x)[0]))
 
 
-def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
-    """Which landmarks [468] bool the mean head has, and the places [3, L] of those in reference space."""
-    mean = prior.tensors["landmarks"]
-    known = np.isfinite(mean).all(axis=1)
-    decoders = mi.Float(prior.tensors["deformation"]), mi.Float(prior.tensors["reference"])
-    zero = mi.TensorXf(np.zeros((len(prior.tensors["z_sdf"]), 1), np.float32))
-    field = signed_distance_field(prior.architecture, *decoders, zero)
-    return known, evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
-
-
-def placed_landmarks(field: SdfField, x_ref, start):
-    """Where the field maps to landmarks' places x_ref [3, L] in reference space: tensor [3, L], found by fixed-point
-    steps from `start` [3, L]. Without gradients."""
-    with dr.suspend_grad():
-        x, x_ref = mi.TensorXf(start), mi.TensorXf(x_ref)
-        for _ in range(_LANDMARK_STEPS):
-            x = x - 0.8 * (deform(field, x)[0] - x_ref)
-            dr.eval(x)
-        return x
+def _inverse(motion):
+    """[3, 4] matrix (Rᵀ | −Rᵀ t) of a rigid motion (R | t)."""
+    turned = dr.concat([dr.reshape(motion[:, k : k + 1], (1, 3)) for k in range(3)], axis=0)
+    return dr.concat([turned, -(turned @ motion[:, 3:4])], axis=1)
 
 
 def _square(latent):

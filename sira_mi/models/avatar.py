@@ -26,8 +26,11 @@ LANDMARKS = 468
 PRIOR = Path(__file__).with_name("prior.safetensors")
 _MAXIMUM_BYTES = 64 << 20
 _MAXIMUM_LOBES = 4096
+_MAXIMUM_DIRECTIONS = 256
 # Networks that an avatar may lack.
 OPTIONAL = {"light_refinement"}
+# Of a prior that knows how landmarks follow from places in reference space (`sira_mi.models.landmark_model`).
+LANDMARK_MODEL = {"landmark_placed", "landmark_directions", "landmark_offsets"}
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,8 @@ def signed_distance_field(architecture: AvatarArchitecture, deformation, referen
 class Avatar:
     """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
     architecture (`light_refinement` may be missing); `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light;
-    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown)."""
+    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown). A prior may hold the
+    tensors of `sira_mi.models.landmark_model` too."""
 
     architecture: AvatarArchitecture
     tensors: dict[str, np.ndarray]
@@ -208,6 +212,12 @@ def _check(avatar: Avatar) -> None:
         raise ValueError(f"between 1 and {_MAXIMUM_LOBES} lobes expected")
     for name in OPTIONAL - set(tensors):
         del due[name]
+    if LANDMARK_MODEL & set(tensors):
+        count = len(tensors["landmark_directions"])
+        if not 0 < count <= _MAXIMUM_DIRECTIONS:
+            raise ValueError(f"between 1 and {_MAXIMUM_DIRECTIONS} directions of landmarks expected")
+        due |= {"landmark_placed": (LANDMARKS, 3)}
+        due |= dict.fromkeys(("landmark_directions", "landmark_offsets"), (count, LANDMARKS, 3))
     for name, shape in due.items():
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.float32:

@@ -10,6 +10,7 @@ from sira_mi.conventions import LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera, estimate_camera, reprojection_error
 from sira_mi.portrait.face import LANDMARKS, Face, find_faces, select_face
+from sira_mi.portrait.head_landmarks import head_landmarks
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
 from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, person_mask
 
@@ -30,7 +31,8 @@ class PortraitSettings:
 class Portrait:
     image: np.ndarray  # [H, W, 3] float32, linear Rec.709
     mask: np.ndarray  # [H, W] float32 in [0, 1], 1 is the person
-    landmarks: np.ndarray  # [468, 2] float64, pixels of `image`; NaN without a face
+    landmarks: np.ndarray  # [468, 2] float64, pixels of `image`, where the photo shows them; NaN without a face
+    head_landmarks: np.ndarray  # [468, 2] likewise, where those of the head are, hidden ones too
     camera: Camera  # of `image`, with square pixels
     notes: tuple[str, ...]  # what the user should know, one line each
 
@@ -56,14 +58,14 @@ class _Window:
 def make_portrait(
     path: str | Path,
     settings: PortraitSettings,
-    head_landmarks: np.ndarray,
+    mean_landmarks: np.ndarray,
     mask_path: str | Path | None = None,
     camera_path: str | Path | None = None,
     face: int | None = None,
 ) -> Portrait:
     """Loads a photo and finds or reads all that the fit needs of it.
 
-    `head_landmarks` `[468, 3]` are the mean head's, in world units, NaN where unknown. `face` counts from 0 by size,
+    `mean_landmarks` `[468, 3]` are the mean head's, in world units, NaN where unknown. `face` counts from 0 by size,
     largest first. With both `mask_path` and `camera_path` a photo without a face will do.
     Raises `InputError` for whatever the user can mend.
     """
@@ -81,26 +83,27 @@ def make_portrait(
     else:
         notes.append("no face found: using the given camera and mask alone")
 
+    in_photo = None if found is None else head_landmarks(found)
     camera = given_camera
     if camera is None:
         assert found is not None  # select_face raises otherwise
-        camera = _fit_camera(photo, found, head_landmarks, notes)
+        camera = _fit_camera(photo, in_photo, found.size, mean_landmarks, notes)
     window = _choose_window(photo, found, camera, settings.working_size, notes)
     image = np.maximum(window.resample(photo.image), 0)
     height, width = image.shape[:2]
     camera = camera.cropped(window.x0, window.y0, 0, 0).scaled(window.scale_x, window.scale_y, width, height)
 
-    landmarks = np.full((LANDMARKS, 2), np.nan)
+    landmarks = of_head = np.full((LANDMARKS, 2), np.nan)
     working_face = None
     if found is not None:
-        landmarks = window.to_working(found.landmarks)
+        landmarks, of_head = window.to_working(found.landmarks), window.to_working(in_photo)
         working_face = Face(landmarks, found.depth * window.scale_x, found.presence)
     mask = _make_mask(photo, given_mask, window, image, working_face, notes)
     if given_camera is not None and working_face is not None:
-        error = reprojection_error(camera, landmarks, np.asarray(head_landmarks, np.float64))
+        error = reprojection_error(camera, of_head, np.asarray(mean_landmarks, np.float64))
         if error > _CAMERA_MISMATCH * working_face.size:
             notes.append(f"the given camera shows the head {error:.0f} pixels away from the face in the photo")
-    return Portrait(image.astype(np.float32), mask.astype(np.float32), landmarks, camera, tuple(notes))
+    return Portrait(image.astype(np.float32), mask.astype(np.float32), landmarks, of_head, camera, tuple(notes))
 
 
 def display_image(image: np.ndarray) -> np.ndarray:
@@ -152,15 +155,17 @@ def _read_camera(path: str | Path, photo: Photo) -> Camera:
     return camera.scaled(1 / photo.reduction, 1 / photo.reduction, width, height)
 
 
-def _fit_camera(photo: Photo, face: Face, head_landmarks: np.ndarray, notes: list[str]) -> Camera:
+def _fit_camera(
+    photo: Photo, landmarks: np.ndarray, face_size: float, mean_landmarks: np.ndarray, notes: list[str]
+) -> Camera:
     height, width = photo.image.shape[:2]
-    camera = estimate_camera(face.landmarks, head_landmarks, width, height, photo.focal_35mm)
-    error = reprojection_error(camera, face.landmarks, np.asarray(head_landmarks, np.float64))
+    camera = estimate_camera(landmarks, mean_landmarks, width, height, photo.focal_35mm)
+    error = reprojection_error(camera, landmarks, np.asarray(mean_landmarks, np.float64))
     source = "the photo's EXIF data" if photo.focal_35mm is not None else "the face and a usual distance"
     distance = np.linalg.norm(camera.centre) * MILLIMETRES_PER_UNIT / 1000
     notes.append(
         f"camera from landmarks: {distance:.2f} m away, focal length from {source}, "
-        f"{error:.1f} pixels off on average ({100 * error / face.size:.1f}% of the face)"
+        f"{error:.1f} pixels off on average ({100 * error / face_size:.1f}% of the face)"
     )
     return camera
 

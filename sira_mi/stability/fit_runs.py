@@ -100,9 +100,9 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
     from sira_mi.fit import output
     from sira_mi.fit.driver import Progress
     from sira_mi.fit.fit import FitRequest, finished_avatar, fit_portrait, initial_tensors, read_portrait, with_pose
-    from sira_mi.fit.geometry import placed_landmarks, reference_landmarks
     from sira_mi.fit.settings import without
     from sira_mi.models.avatar import load_avatar, save_avatar
+    from sira_mi.models.landmark_model import landmarks_of
     from sira_mi.portrait.camera import Camera
     from sira_mi.portrait.load import linear_to_srgb
     from sira_mi.portrait.portrait import area_resample
@@ -125,10 +125,7 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
     write_png(picture, np.concatenate(shown, axis=1))
 
     vertices, faces = head.vertices().T, mi.traverse(head)["faces"].numpy().reshape(-1, 3)
-    known, x_ref = reference_landmarks(prior)
-    landmarks = np.full((len(known), 3), np.nan)
-    start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
-    landmarks[known] = placed_landmarks(head.field(), x_ref, start).numpy().T
+    landmarks = landmarks_of(prior, head.field())
     height, width = truth.mask.shape
     scale = camera.width / width, camera.height / height
     inside = truth.mask[::-1, ::-1] if fed.turned else truth.mask

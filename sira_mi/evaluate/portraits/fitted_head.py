@@ -19,10 +19,10 @@ from sira_mi.files import write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress
 from sira_mi.fit.fit import finished_avatar, fit_portrait, initial_tensors, with_pose
-from sira_mi.fit.geometry import placed_landmarks, reference_landmarks
 from sira_mi.fit.settings import FitSettings
 from sira_mi.fit.shaded import seen_points
 from sira_mi.models.avatar import Avatar, load_avatar, save_avatar
+from sira_mi.models.landmark_model import landmarks_of
 from sira_mi.models.optimisation import read_arrays, write_arrays
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
@@ -76,14 +76,10 @@ def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settin
         scene = output.avatar_scene(str(path), camera, avatar.tensors["lobes"], settings.final_voxel, in_photo=True)
         head = scene.shapes()[0]
         pictures = output.render_layers(scene)
-    known, x_ref = reference_landmarks(prior)
-    start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
-    landmarks = np.full((len(known), 3), np.nan, np.float32)
-    landmarks[known] = placed_landmarks(head.field(), x_ref, start).numpy().T
     arrays = {
         "vertices": head.vertices().T,
         "faces": mi.traverse(head)["faces"].numpy().reshape(-1, 3),
-        "landmarks": landmarks,
+        "landmarks": landmarks_of(prior, head.field()),
         "K": camera.K,
         "world_to_camera": camera.world_to_camera,
         **{f"image/{name}": image.astype(np.float32) for name, image in pictures.items()},

@@ -76,7 +76,7 @@ def ablation(collection: Path, evidence: Path, without: str | None, steps: int, 
     name = COMPLETE if without is None else f"without_{without}"
 
     def measure(model: ShapeModel, scans: list[Scan]) -> dict:
-        w = shape_prior.fit_shape(model, scans, protocol.fit)
+        w = shape_prior.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
         latents = np.stack([model.latent("z_sdf", w[:, k]) for k in range(len(scans))], axis=1)
         rows, _ = shape_prior.random_heads(model, 1.0, protocol.heads)
         landmarks = np.stack([scan.scene.landmarks for scan in scans])
@@ -97,7 +97,7 @@ def size(collection: Path, evidence: Path, name: str, sizes: dict[str, int], ste
     `parameters` of the field, and the cost of its evaluation, `forward` and `backward` (µs a point)."""
 
     def measure(model: ShapeModel, scans: list[Scan]) -> dict:
-        w = shape_prior.fit_shape(model, scans, protocol.fit)
+        w = shape_prior.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
         forward, backward = evaluation_cost(model, protocol.cost_points)
         return {
             **fit_scores(model, scans, w, protocol.points),

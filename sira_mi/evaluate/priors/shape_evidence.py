@@ -90,7 +90,7 @@ def _training(runs: Path, parameters: dict[str, np.ndarray]) -> dict:
 
 def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Path) -> dict:
     start = monotonic()
-    w = shape_prior.fit_shape(model, scans, measures.fit)
+    w = shape_prior.fit_shape(model, [scan.scene for scan in scans], measures.fit)
     fitting = monotonic() - start
     zero = model.field(model.latent("z_sdf", 0 * w[:, 0]))
     zero_points = _surface_points(zero, measures.points)

@@ -117,18 +117,20 @@ def _fall(step: int, steps: int) -> float:
     return 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / steps))
 
 
-def fit_shape(model: ShapeModel, scans: Sequence[Scan], fit: ShapeFit | None = None, seed: int = 0) -> np.ndarray:
-    """w [k, S] of the shape latents that bring the surface nearest to each scan, all scans at once, from the mean head
-    on; the networks stay as they are."""
+def fit_shape(
+    model: ShapeModel, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None, seed: int = 0
+) -> np.ndarray:
+    """w [k, S] of the shape latents that bring the surface nearest to each scene's scan, all scans at once, from the
+    mean head on; the networks stay as they are."""
     fit = fit or ShapeFit()
     size = model.bases["z_sdf"].shape[1]
-    optimizer = adam({"w": np.zeros((size, len(scans)), np.float32)}, {"w": fit.rate})
+    optimizer = adam({"w": np.zeros((size, len(scenes)), np.float32)}, {"w": fit.rate})
     for step in range(fit.steps):
         optimizer.set_learning_rate({"w": fit.rate * _fall(step, fit.steps)})
         rng = np.random.default_rng([seed, 11, step])
-        chosen = [rng.integers(len(scan.scene.points), size=fit.points) for scan in scans]
-        points = np.concatenate([s.scene.points[c] for s, c in zip(scans, chosen, strict=True)])
-        normals = np.concatenate([s.scene.normals[c] for s, c in zip(scans, chosen, strict=True)])
+        chosen = [rng.integers(len(scene.points), size=fit.points) for scene in scenes]
+        points = np.concatenate([s.points[c] for s, c in zip(scenes, chosen, strict=True)])
+        normals = np.concatenate([s.normals[c] for s, c in zip(scenes, chosen, strict=True)])
         w = optimizer["w"]
         dr.enable_grad(w)
         field = model.field(_latents(model, "z_sdf", w))

@@ -1,0 +1,103 @@
+"""Where the landmarks of the head lie in the photo, hidden ones too: a correction of what the landmark network finds.
+
+The network draws the far side of a turned face too near, and calls other points of a head its landmarks than those that
+the prior's heads carry. That error goes with the direction from which the face is seen, and the correction is a
+polynomial of it. The coefficients come from portraits of heads whose landmarks are known
+(`python -m sira_mi.evaluate landmarks`). Coordinates of the face's shape would tell a little more of the error on such
+heads (`docs/benchmark.md`), but rendered heads do not smile, and the correction of a smile was wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from sira_mi.errors import InputError
+from sira_mi.files import write_through
+from sira_mi.portrait.face import LANDMARKS, Face
+from sira_mi.portrait.landmarks import RIGID
+
+CORRECTION = Path(__file__).parent / "models" / "head_landmarks.safetensors"
+TERMS = 7  # of the polynomial
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkCorrection:
+    """The offset of a face's landmarks by where it is seen from."""
+
+    mean: np.ndarray  # [468, 3] the network's mean face, seen from the front
+    reach: np.ndarray  # [2] largest yaw and pitch that were measured, radians: beyond them the offset stays
+    offsets: np.ndarray  # [7, 468, 2] by `polynomial`, in face sizes, along the axes of the upright face
+
+    def save(self, path: Path) -> None:
+        """Raises InputError when the file cannot be written."""
+        arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in vars(self).items()}
+        write_through(path, lambda file: save_file(arrays, file))
+
+    @staticmethod
+    def load(path: Path) -> LandmarkCorrection:
+        """Raises InputError for a file that is missing or damaged."""
+        shapes = {"mean": (LANDMARKS, 3), "reach": (2,), "offsets": (TERMS, LANDMARKS, 2)}
+        try:
+            arrays = load_file(path)
+            for name, shape in shapes.items():
+                if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+                    raise ValueError(f"{name} is not finite numbers {list(shape)}")
+            return LandmarkCorrection(**{name: arrays[name].astype(np.float64) for name in shapes})
+        except (OSError, KeyError, ValueError, TypeError, SafetensorError) as error:
+            raise InputError(f"{path} is missing or damaged ({error}): install the package again") from error
+
+
+@lru_cache(maxsize=1)
+def shipped_correction() -> LandmarkCorrection:
+    return LandmarkCorrection.load(CORRECTION)
+
+
+def head_landmarks(face: Face, correction: LandmarkCorrection | None = None) -> np.ndarray:
+    """Where the head's landmarks lie [468, 2], in the pixels of `face`; by the shipped correction unless another is
+    given."""
+    correction = correction or shipped_correction()
+    terms = polynomial(np.clip(seen_from(face, correction.mean), -correction.reach, correction.reach))
+    offset = np.tensordot(terms, correction.offsets, axes=1)
+    return face.landmarks + face.size * offset @ upright_axes(face)
+
+
+def polynomial(direction: np.ndarray) -> np.ndarray:
+    """The terms [..., 7] of yaw and pitch [..., 2]: of second order, and yaw |yaw| for what a face hides of its far
+    side."""
+    yaw, pitch = direction[..., 0], direction[..., 1]
+    return np.stack([np.ones_like(yaw), yaw, pitch, yaw**2, yaw * pitch, pitch**2, yaw * np.abs(yaw)], axis=-1)
+
+
+def seen_from(face: Face, mean: np.ndarray) -> np.ndarray:
+    """Yaw and pitch [2] of the viewing direction in the frame of the `mean` face [468, 3], radians, by the rigid parts
+    of the face; a roll of the photo does not change them."""
+    x, y, z = _rotation(face, mean)[:, 2]
+    return np.array([np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))])
+
+
+def aligned_face(face: Face, mean: np.ndarray) -> np.ndarray:
+    """The network's landmarks with their depth [468, 3], in face sizes about their centre, turned as the `mean` face
+    [468, 3]."""
+    points = np.column_stack([face.landmarks, face.depth]) / face.size
+    return (points - points.mean(axis=0)) @ _rotation(face, mean).T
+
+
+def upright_axes(face: Face) -> np.ndarray:
+    """The directions in the photo [2, 2] of the upright face's x axis, along its eyes, and y axis, as rows."""
+    cosine, sine = np.cos(np.radians(face.roll)), np.sin(np.radians(face.roll))
+    return np.array([[cosine, sine], [-sine, cosine]])
+
+
+def _rotation(face: Face, mean: np.ndarray) -> np.ndarray:
+    """[3, 3] from the photo's axes to those of the mean face: of least squares, over the rigid parts."""
+    rigid = list(RIGID)
+    points = np.column_stack([face.landmarks, face.depth])[rigid]
+    target = mean[rigid]
+    u, _, v = np.linalg.svd((target - target.mean(axis=0)).T @ (points - points.mean(axis=0)))
+    return u * np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
