@@ -27,7 +27,7 @@ class GeometryWeights:
     mask: float = 2.0  # on a mean over rays, in scene units
     eikonal: float = 0.05
     landmark: float = 0.4  # on reprojection errors in face sizes
-    embedding: float = 6e-5  # on ‖z‖², keeps latents where the prior was trained
+    embedding: float = 6e-6  # on ‖z‖², keeps latents where the prior was trained
     stay: float = 0.5  # on mean |δ − δ₀| against the prior's deformation network
 
 
