@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
@@ -37,7 +37,7 @@ class LandmarkCorrection:
     def save(self, path: Path) -> None:
         """Raises InputError when the file cannot be written."""
         arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in vars(self).items()}
-        write_through(path, lambda file: save_file(arrays, file))
+        write_through(path, lambda file: file.write_bytes(save(arrays)))
 
     @staticmethod
     def load(path: Path) -> LandmarkCorrection:
