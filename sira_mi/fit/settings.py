@@ -115,7 +115,7 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
                 shape_steps(240),
                 _rates(shape, 6e-3, networks, 4e-4, 2e-3),
                 mask_sharpness=60,
-                landmark=0.5,
+                landmark=0.25,
             ),
         ),
         (
@@ -125,7 +125,7 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
                 shape_steps(120),
                 _rates(shape, 2e-3, networks, 1.5e-4, 1e-3),
                 mask_sharpness=240,
-                landmark=0.2,
+                landmark=0.1,
             ),
         ),
         (APPEARANCE, Stage("light", steps(120), {"z_l": 1e-1, "illumination": 1e-3})),
