@@ -297,7 +297,8 @@ which moves the surface too; no quality ships with it), b.5 polished by path tra
 the upper hemisphere at every point: no shadows, and no light that the head reflects onto itself. b.7 is b.3 as the
 paper has it, without a refinement of the light: all that base albedo and light leave of the photo goes to the albedo.
 A method without a row was left out by `--methods`: a.1 and a.2, when they were last measured, with the rendering
-function fixed in the first stage of all methods, had a face of 3.58 and 3.53 mm and normals of 27°.
+function fixed in the first stage of all methods, had a face of 3.58 and 3.53 mm and normals of 27°. b.5, before the
+landmarks of the head, had the scores of b.3 within 0.2 dB.
 
 """
 
