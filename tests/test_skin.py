@@ -60,23 +60,39 @@ def blind_portraits(portrait: Portrait) -> tuple[Portrait, Portrait]:
 def test_the_white_of_the_eyes_tells_light_from_skin(variant, portrait):
     """The ratio of skin to eyes does not depend on the exposure; where eyes are as bright, skin is light. An eye that
     is not seen does not count; without any, brightness alone tells. Dark glasses do not make skin white."""
-    from sira_mi.fit.skin import SkinCues, skin_cues, skin_luminance
+    from sira_mi.fit.skin import Eye, SkinCues, skin_cues, skin_luminance
 
     landmarks = portrait.landmarks.copy()
     landmarks[list(LEFT_EYE)] = np.nan
     one = dataclasses.replace(portrait, landmarks=landmarks)
-    assert skin_cues(one).over_white == pytest.approx(-np.log(2), abs=1e-5)
-    assert skin_cues(darker(one, 4)).over_white == pytest.approx(-np.log(2), abs=1e-5)
+    for factor in (1, 4):
+        (eye,) = skin_cues(darker(one, factor)).eyes
+        assert eye.contrast == pytest.approx(-np.log(2), abs=1e-5)
+        assert eye.white == pytest.approx(np.log(2 * USUAL / factor), abs=1e-5)
     eyeless = portrait.landmarks.copy()
     eyeless[[*EYES, *LEFT_EYE]] = np.nan
     blind = skin_cues(dataclasses.replace(portrait, landmarks=eyeless))
-    assert blind.over_white is None and blind.radiance == pytest.approx(USUAL, rel=1e-5)
-    levels = [skin_luminance(SkinCues(0.2, contrast)) for contrast in (-1.5, -0.7, 0.0)]
+    assert blind.eyes == () and blind.radiance == pytest.approx(USUAL, rel=1e-5)
+    levels = [skin_luminance(SkinCues(0.2, (Eye(contrast, -1),))) for contrast in (-1.5, -0.7, 0.0)]
     assert 0.07 < levels[0] < levels[1] < levels[2] < 0.45
-    assert levels[0] < skin_luminance(SkinCues(0.2, None)) < levels[2]
+    assert levels[0] < skin_luminance(SkinCues(0.2, ())) < levels[2]
     sunglasses = dataclasses.replace(one, image=np.where(one.image > USUAL * 1.01, 0, one.image))
-    assert skin_luminance(skin_cues(sunglasses)) < 0.5
-    assert skin_luminance(SkinCues(1e-3, -6.0)) > 0.03
+    assert skin_luminance(skin_cues(sunglasses)) < 0.45
+    assert skin_luminance(SkinCues(1e-3, (Eye(-6.0, -1),))) > 0.06
+
+
+def test_an_eye_that_misleads_hardly_counts(variant):
+    """Two eyes that agree tell more than one; of two that do not, the one in the brighter light does."""
+    from sira_mi.fit.skin import Eye, SkinCues, skin_luminance
+
+    def level(*eyes: Eye) -> float:
+        return float(np.log(skin_luminance(SkinCues(0.1, eyes))))
+
+    lit, shaded = Eye(-0.2, -1.0), Eye(-1.7, -2.5)
+    assert abs(level(lit, shaded) - level(lit)) < 0.1 < abs(level(lit, shaded) - level(shaded))
+    assert level(lit, shaded) == pytest.approx(level(shaded, lit), abs=1e-12)
+    usual = level()
+    assert abs(level(lit, lit) - usual) > abs(level(lit) - usual)
 
 
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):

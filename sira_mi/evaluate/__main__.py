@@ -150,12 +150,11 @@ def measure_skin(arguments: argparse.Namespace) -> None:
     from sira_mi.evaluate.portraits.skin_level import estimate, observe
 
     observations, blind = observe(arguments.benchmark)
-    estimates = {title: estimate(observations, eyes) for title, eyes in (("skin", False), ("skin and eyes", True))}
+    found = estimate(observations)
     spread = np.std(np.log([o.luminance for o in observations]))
     print(f"{len(observations)} portraits, log of the skin's luminance within {spread:.2f}; unseen: {len(blind)}")
-    for title, found in estimates.items():
-        values = ", ".join(f"{value:.2f}" for value in found.coefficients)
-        print(f"by {title}: {values}; error {found.error:.2f}")
+    print(f"by skin: error {found.error_by_skin:.2f}; by skin and eyes: error {found.error:.2f}, with")
+    print(", ".join(f"{name} {value:.2f}" for name, value in vars(found.level).items()))
 
 
 def correct_landmarks(arguments: argparse.Namespace) -> None:

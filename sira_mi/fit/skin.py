@@ -3,15 +3,19 @@ albedo's.
 
 How light skin is and how bright the light on it, a photo tells by two cues: how bright the skin is in it (photos are
 exposed for the light in part only), and how bright it is against the white of the eyes, which differs little between
-people and is lit like the skin below it."""
+people and is lit like the skin below it. Some eyes mislead: they lie in the shadow of the brow, or a light catches them
+that the cheek does not see; more often the one that is darker than the other. Each eye counts as the reading of a gauge
+that may be broken."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import expit, softmax
 from skimage.draw import polygon2mask
 
 from sira_mi.conventions import LUMINANCE
@@ -30,12 +34,20 @@ _DARKEST = 1e-3
 _EXPOSURES = (0.5, 16.0)
 # The white of an eye is as bright as the brightest tenth of its opening, percent.
 _WHITE = 90
-# Log luminance of skin's albedo by the photo's cues, of `python -m sira_mi.evaluate skin` on portraits of training
-# heads: a constant, what it rises with the log radiance of the skin and with the log of that over the eyes' white.
-_BY_SKIN = (-1.12, 0.23)
-_BY_SKIN_AND_EYES = (-1.05, 0.14, 0.57)
-# Skin is neither darker nor lighter, L* 30 to 73; cues that say so are of no open eye in the skin's light.
+# Skin is neither darker nor lighter, L* 30 to 73.
 _SKIN = (0.06, 0.45)
+# Contrasts beyond these count as these, and those that mislead lie anywhere between.
+_CONTRASTS = (-1.9, 0.05)
+# Values of y that are weighed against each other.
+_LEVELS = 161
+
+
+@dataclass(frozen=True)
+class Eye:
+    """What an eye tells of the skin below it."""
+
+    contrast: float  # log of the skin's luminance over that of the eye's white
+    white: float  # log luminance of the white
 
 
 @dataclass(frozen=True)
@@ -43,13 +55,47 @@ class SkinCues:
     """What a photo tells of its skin."""
 
     radiance: float  # luminance of the skin, geometric mean
-    over_white: float | None  # log of its luminance below the eyes over the white of the eyes; None where none is seen
+    eyes: tuple[Eye, ...]  # those seen
+
+
+@dataclass(frozen=True)
+class SkinLevel:
+    """How the cues of a photo follow from y, the log luminance of its skin's albedo: y is normal about usual +
+    by_radiance · log radiance, the contrast of an eye about y − white, and with odds of exp(misleading + darker · the
+    log of the brighter eye's white over its own) it is anything. The values are those of `python -m sira_mi.evaluate
+    skin` on portraits of training heads."""
+
+    usual: float = -1.38
+    by_radiance: float = 0.25
+    spread: float = 0.61
+    white: float = -1.02
+    deviation: float = 0.17
+    misleading: float = -2.29
+    darker: float = 1.98
+
+    def log_luminance(self, radiance: np.ndarray, contrast: np.ndarray, white: np.ndarray) -> np.ndarray:
+        """The mean of y [N] given the log radiance of skin [N] and of two eyes their contrasts and log luminances
+        [N, 2], NaN where an eye is not seen."""
+        y = np.linspace(*np.log(_SKIN), _LEVELS)
+        expected = self.usual + self.by_radiance * radiance[:, None]
+        log_odds = -(((y - expected) / self.spread) ** 2) / 2
+        brighter = np.fmax(white[:, 0], white[:, 1])
+        for eye in range(2):
+            reading = np.clip(contrast[:, eye : eye + 1], *_CONTRASTS)
+            shift = (reading - (y - self.white)) / self.deviation
+            right = np.exp(-(shift**2) / 2) / (self.deviation * np.sqrt(2 * np.pi))
+            share = expit(self.misleading + self.darker * (brighter - white[:, eye]))[:, None]
+            seen = np.isfinite(reading)
+            either = (1 - share) * right + share / np.ptp(_CONTRASTS)
+            log_odds = log_odds + np.log(either, where=seen, out=np.zeros_like(either))
+        weights = softmax(log_odds, axis=1)
+        return weights @ y
 
 
 def skin_cues(portrait: Portrait) -> SkinCues | None:
     """What a photo tells of its skin; None where no skin is seen."""
     luminance = _luminance_near(portrait, SKIN_LANDMARKS)
-    return SkinCues(float(np.exp(np.log(luminance).mean())), _over_white(portrait)) if len(luminance) else None
+    return SkinCues(float(np.exp(np.log(luminance).mean())), _eyes(portrait)) if len(luminance) else None
 
 
 def near_landmarks(landmarks: np.ndarray, chosen: tuple[int, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,9 +122,9 @@ def _luminance_near(portrait: Portrait, chosen: tuple[int, ...]) -> np.ndarray:
     return np.maximum(portrait.image[row, column] @ np.array(LUMINANCE), _DARKEST)
 
 
-def _over_white(portrait: Portrait) -> float | None:
-    """Log of the luminance of the skin below an eye over that of the eye's white, mean of the eyes seen."""
-    contrasts = []
+def _eyes(portrait: Portrait) -> tuple[Eye, ...]:
+    """The eyes whose white and skin below are seen."""
+    seen = []
     for opening, below in zip(EYES, BELOW_EYES, strict=True):
         outline, skin = portrait.landmarks[list(opening)], _luminance_near(portrait, below)
         if not np.isfinite(outline).all() or not len(skin):
@@ -86,8 +132,9 @@ def _over_white(portrait: Portrait) -> float | None:
         inside = polygon2mask(portrait.mask.shape, outline[:, ::-1] - 0.5) & (portrait.mask > 0.5)
         if inside.any():
             white = np.percentile(portrait.image[inside] @ np.array(LUMINANCE), _WHITE)
-            contrasts.append(np.log(np.median(skin) / max(white, _DARKEST)))
-    return float(np.mean(contrasts)) if contrasts else None
+            white = np.log(max(white, _DARKEST))
+            seen.append(Eye(float(np.log(np.median(skin)) - white), float(white)))
+    return tuple(seen)
 
 
 def face_exposure(portrait: Portrait) -> float:
@@ -97,15 +144,17 @@ def face_exposure(portrait: Portrait) -> float:
     return 1.0 if cues is None else float(np.clip(AppearanceTraining().skin_radiance / cues.radiance, *_EXPOSURES))
 
 
-def skin_luminance(cues: SkinCues) -> float:
+def skin_luminance(cues: SkinCues, level: SkinLevel | None = None) -> float:
     """Luminance of the albedo of skin in a photo with these cues."""
-    if cues.over_white is None:
-        constant, by_radiance = _BY_SKIN
-        level = constant + by_radiance * np.log(cues.radiance)
-    else:
-        constant, by_radiance, by_white = _BY_SKIN_AND_EYES
-        level = constant + by_radiance * np.log(cues.radiance) + by_white * cues.over_white
-    return float(np.clip(np.exp(level), *_SKIN))
+    return float(np.exp((level or SkinLevel()).log_luminance(*cue_arrays([cues])))[0])
+
+
+def cue_arrays(cues: Sequence[SkinCues]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The arguments of `SkinLevel.log_luminance`, of N photos."""
+    missing = Eye(np.nan, np.nan)
+    eyes = [(*one.eyes, missing, missing)[:2] for one in cues]
+    contrast, white = (np.array([[getattr(e, name) for e in pair] for pair in eyes]) for name in ("contrast", "white"))
+    return np.log([one.radiance for one in cues]), contrast, white
 
 
 @dataclass(frozen=True)

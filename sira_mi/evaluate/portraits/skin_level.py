@@ -1,10 +1,12 @@
 """What a photo tells of the level of its skin's albedo: least squares over portraits whose albedo is known, which gives
-the constants of `sira_mi.fit.skin`. Portraits of training heads serve, since a fit may know nothing of the others."""
+the values of `sira_mi.fit.skin.SkinLevel`. Portraits of training heads serve, since a fit may know nothing of the
+others."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import minimize
 from tqdm import tqdm
 
 from sira_mi.collection.skin import SKIN
@@ -13,13 +15,19 @@ from sira_mi.errors import InputError
 from sira_mi.evaluate.portraits.benchmark import read_benchmark
 from sira_mi.evaluate.portraits.truth import Truth, load_truth
 from sira_mi.fit.settings import QUALITIES
-from sira_mi.fit.skin import SkinCues, near_landmarks, skin_cues
+from sira_mi.fit.skin import SkinCues, SkinLevel, cue_arrays, near_landmarks, skin_cues
 from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.models.skin_tone import SKIN_LANDMARKS
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
 
 # Fewer portraits than this with eyes, or fewer heads, determine nothing.
 _LEAST_PORTRAITS, _LEAST_HEADS = 12, 4
+_FOLDS = 8
+# Where the search begins: usual, by_radiance, log spread, white, log deviation, misleading, darker; how far from there
+# each may be expected, and how much that counts beside the mean square error.
+_START = np.array([-1.35, 0.2, np.log(0.45), -0.9, np.log(0.15), -1.0, 1.0])
+_START_WIDTH = np.array([0.5, 0.2, 0.5, 0.3, 0.7, 1.0, 1.0])
+_PULL, _EVALUATIONS = 2e-3, 1200
 
 
 @dataclass(frozen=True)
@@ -33,10 +41,11 @@ class Observation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Least squares of the log luminance of the albedo by some cues."""
+    """The level that tells most of the albedo."""
 
-    coefficients: np.ndarray  # [1 + number of cues], the constant first
-    error: float  # root mean square of the logs, each head by the others' coefficients
+    level: SkinLevel
+    error: float  # root mean square of the log luminance, each head by what the others tell
+    error_by_skin: float  # the same by the skin's radiance alone, least squares
 
 
 def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
@@ -68,26 +77,47 @@ def true_luminance(truth: Truth) -> float | None:
     return float((truth.diffuse_albedo[row, column] @ np.array(LUMINANCE)).mean()) if len(row) else None
 
 
-def estimate(observations: list[Observation], eyes: bool) -> Estimate:
-    """By the radiance of the skin and, with `eyes`, its ratio to their white, over the portraits that show eyes.
-    Raises InputError for too few of them."""
-    seen = [o for o in observations if o.cues.over_white is not None]
-    heads = np.array([o.head for o in seen])
-    if len(seen) < _LEAST_PORTRAITS or len(set(heads)) < _LEAST_HEADS:
+def estimate(observations: list[Observation]) -> Estimate:
+    """Least squares of the log luminance. Raises InputError for too few portraits that show eyes."""
+    eyes = [o.head for o in observations if o.cues.eyes]
+    if len(eyes) < _LEAST_PORTRAITS or len(set(eyes)) < _LEAST_HEADS:
         raise InputError(
-            f"{len(seen)} portraits of {len(set(heads))} heads show skin and eyes: "
+            f"{len(eyes)} portraits of {len(set(eyes))} heads show skin and eyes: "
             f"{_LEAST_PORTRAITS} of {_LEAST_HEADS} are needed"
         )
-    columns = [np.ones(len(seen)), np.log([o.cues.radiance for o in seen])]
-    if eyes:
-        columns.append(np.array([o.cues.over_white for o in seen]))
-    cues, target = np.stack(columns, axis=1), np.log([o.luminance for o in seen])
-    errors = np.zeros(len(seen))
-    for head in set(heads):
-        other = heads != head
-        errors[~other] = cues[~other] @ _least_squares(cues[other], target[other]) - target[~other]
-    return Estimate(_least_squares(cues, target), float(np.sqrt((errors**2).mean())))
+    target = np.log([o.luminance for o in observations])
+    heads = sorted({o.head for o in observations})
+    fold = np.array([heads.index(o.head) % _FOLDS for o in observations])
+    errors, by_skin = np.zeros(len(target)), np.zeros(len(target))
+    for k in range(_FOLDS):
+        other, left_out = ([o for o, own in zip(observations, fold == k, strict=True) if own == out] for out in (0, 1))
+        if not left_out:
+            continue
+        errors[fold == k] = _predicted(_fitted(other), left_out) - target[fold == k]
+        line = np.polynomial.Polynomial.fit(*_by_radiance(other), 1)
+        by_skin[fold == k] = line(_by_radiance(left_out)[0]) - target[fold == k]
+    error, error_by_skin = (float(np.sqrt((e**2).mean())) for e in (errors, by_skin))
+    return Estimate(_fitted(observations), error, error_by_skin)
 
 
-def _least_squares(cues: np.ndarray, target: np.ndarray) -> np.ndarray:
-    return np.linalg.lstsq(cues, target, rcond=None)[0]
+def _by_radiance(observations: list[Observation]) -> tuple[np.ndarray, np.ndarray]:
+    return np.log([o.cues.radiance for o in observations]), np.log([o.luminance for o in observations])
+
+
+def _predicted(level: SkinLevel, observations: list[Observation]) -> np.ndarray:
+    return level.log_luminance(*cue_arrays([o.cues for o in observations]))
+
+
+def _fitted(observations: list[Observation]) -> SkinLevel:
+    """Least squares with a weak pull to the start, which the few misleading eyes need; widths by their logarithms."""
+    cues, target = cue_arrays([o.cues for o in observations]), np.log([o.luminance for o in observations])
+
+    def level(x: np.ndarray) -> SkinLevel:
+        usual, by_radiance, spread, white, deviation, misleading, darker = x
+        return SkinLevel(usual, by_radiance, np.exp(spread), white, np.exp(deviation), misleading, darker)
+
+    def loss(x: np.ndarray) -> float:
+        pull = (((x - _START) / _START_WIDTH) ** 2).mean()
+        return float(((level(x).log_luminance(*cues) - target) ** 2).mean()) + _PULL * pull
+
+    return level(minimize(loss, _START, method="Nelder-Mead", options={"maxfev": _EVALUATIONS}).x)
