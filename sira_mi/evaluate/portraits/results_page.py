@@ -387,7 +387,7 @@ mean tell the skin's level: on this benchmark diffuse albedo 22.4 → 23.4 dB, s
   times the weight that holds the parts to their shares: 24.5 dB with these, final render 30.7."""
 
 _COSTS_TEXT = """Wall-clock time of processes, their start and the writing of scored pictures included; a fit as shipped
-is a.4 and b.3 together. b.1, b.5 and b.7 ran beside other work."""
+is a.4 and b.3 together. Some fits of b.3 ran beside tests."""
 
 _INTRODUCTION = """# Results of the single-image fit
 
