@@ -4,7 +4,7 @@
 `docs/priors.md` and its pictures; `sizes` trains and measures networks of several sizes for a table on that page.
 Results are kept in RUNS/evidence, so that only what has changed is measured again. `benchmark` photographs test heads
 of the collection under known light; portraits that are there already are kept. `skin` measures on such portraits, of
-training heads, what brightness of skin and eyes tell of the skin's albedo: the constants of `sira_mi.fit.skin`.
+training heads, what brightness of skin and eyes tell of the skin's albedo: the values of `sira_mi.fit.skin`.
 `landmarks` measures on them, and on the collection's training scans, where landmarks of found faces and of the prior's
 heads are off, and writes both corrections. `fits` fits and scores the benchmark's portraits and writes
 `docs/results.md`.

@@ -144,9 +144,9 @@ def face_exposure(portrait: Portrait) -> float:
     return 1.0 if cues is None else float(np.clip(AppearanceTraining().skin_radiance / cues.radiance, *_EXPOSURES))
 
 
-def skin_luminance(cues: SkinCues, level: SkinLevel | None = None) -> float:
+def skin_luminance(cues: SkinCues) -> float:
     """Luminance of the albedo of skin in a photo with these cues."""
-    return float(np.exp((level or SkinLevel()).log_luminance(*cue_arrays([cues])))[0])
+    return float(np.exp(SkinLevel().log_luminance(*cue_arrays([cues])))[0])
 
 
 def cue_arrays(cues: Sequence[SkinCues]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

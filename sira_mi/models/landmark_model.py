@@ -79,7 +79,7 @@ def landmarks_of(prior: Avatar, field: SdfField) -> np.ndarray:
 def landmark_tensors(prior: Avatar, placed: np.ndarray, landmarks: np.ndarray) -> dict[str, np.ndarray]:
     """The tensors of `LandmarkModel`, by ridge regression over heads of the prior whose places [S, 468, 3], as
     `landmarks_of` has them without a model, and true landmarks [S, 468, 3] are given. What a head does not know counts
-    as the mean of the others."""
+    as the mean head's."""
     known = np.isfinite(prior.tensors["landmarks"]).all(axis=1)
     mean = prior.tensors["landmarks"][known]
     true = landmarks[:, known] - mean

@@ -90,7 +90,8 @@ def estimate(observations: list[Observation]) -> Estimate:
     fold = np.array([heads.index(o.head) % _FOLDS for o in observations])
     errors, by_skin = np.zeros(len(target)), np.zeros(len(target))
     for k in range(_FOLDS):
-        other, left_out = ([o for o, own in zip(observations, fold == k, strict=True) if own == out] for out in (0, 1))
+        other = [o for o, own in zip(observations, fold, strict=True) if own != k]
+        left_out = [o for o, own in zip(observations, fold, strict=True) if own == k]
         if not left_out:
             continue
         errors[fold == k] = _predicted(_fitted(other), left_out) - target[fold == k]
