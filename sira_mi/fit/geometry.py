@@ -155,11 +155,12 @@ class GeometryProblem:
         weight = mi.TensorXf(np.broadcast_to(covered / (3 * max(covered.sum(), 1)), (3, len(rows))).astype(np.float32))
         color = dr.sum(dr.abs(difference) * weight, axis=None)
 
-        # IDR's mask loss, BCE(σ(−α min f)) / α, from the logit −α min f.
+        # BCE(σ(−α min f)) / α as in IDR, from the logit −α min f, but over all rays: without those that hit inside the
+        # mask, as IDR has it, the outline comes to rest ln 2 / α too far inside.
         alpha = stage.mask_sharpness
         logit = -alpha * closest
         entropy = dr.maximum(logit, 0.0) + dr.log(1 + dr.exp(-dr.abs(logit))) - logit * mi.Float(target[3])
-        return color, dr.sum(entropy * mi.Float(~covered)) / (alpha * max(len(rows), 1))
+        return color, dr.sum(entropy) / (alpha * max(len(rows), 1))
 
     def _eikonal_points(self, rng: np.random.Generator):
         """Half uniform in the domain, half near the mesh; [3, points]."""

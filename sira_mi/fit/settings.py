@@ -24,7 +24,7 @@ class GeometryWeights:
     """Weights of the losses of section 3.2.1 (IDR: colour 1, mask 100 over a sum of BCE / α, eikonal 0.1)."""
 
     color: float = 1.0
-    mask: float = 2.0  # on a mean over rays, in scene units
+    mask: float = 4.0  # on a mean over rays, in scene units
     eikonal: float = 0.05
     landmark: float = 0.4  # on reprojection errors in face sizes
     embedding: float = 6e-6  # on ‖z‖², keeps latents where the prior was trained
