@@ -155,8 +155,8 @@ class GeometryProblem:
         weight = mi.TensorXf(np.broadcast_to(covered / (3 * max(covered.sum(), 1)), (3, len(rows))).astype(np.float32))
         color = dr.sum(dr.abs(difference) * weight, axis=None)
 
-        # BCE(σ(−α min f)) / α as in IDR, from the logit −α min f, but over all rays: without those that hit inside the
-        # mask, as IDR has it, the outline comes to rest ln 2 / α too far inside.
+        # BCE(σ(−α min f)) / α as in IDR, from the logit −α min f, but over all rays. IDR leaves out those that
+        # hit inside the mask; no derivative sees which these are, and the outline comes to rest up to ln 2 / α inside.
         alpha = stage.mask_sharpness
         logit = -alpha * closest
         entropy = dr.maximum(logit, 0.0) + dr.log(1 + dr.exp(-dr.abs(logit))) - logit * mi.Float(target[3])
