@@ -78,8 +78,8 @@ On six other heads of the test split, at `draft`, unless said: few, so that figu
 size. None of this is in the shipped fit.
 
 - **The camera's frame.** The landmark model errs by 4° on average on these heads, and hair over a turned face misleads
-  it most: for `makehuman_0199_outdoor` the camera starts 20% too far away, and the head grows with it; since the outline
-  counts for more, its face is off by 1.71 instead of 1.47 mm, the other eleven by 1.22 as before. The photo hardly
+  it most: for `makehuman_0199_outdoor` the camera starts 20% too far away, and the head grows with it; since outlines
+  count for more, its face is off by 1.71 instead of 1.47 mm, the other eleven by 1.22 as before. The photo hardly
   corrects a camera: with the true one given, two heads still ended at 1.8 and 2.6 mm in its frame and 0.95 and 1.12 mm
   after ICP, with the same losses as from the estimated one. Three times the pose's learning rate: 1.02 → 1.09 and
   0.99 → 0.88 mm. A correction of the landmarks' bias by yaw and pitch, learned from 412 views of 100 training heads, or
