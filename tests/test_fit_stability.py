@@ -90,6 +90,27 @@ def test_rates_too_high_are_detected_and_halved(factor, capsys):
     assert distance(progress) < 0.5
 
 
+class Rectifier:
+    """The least network that can die: above the target its loss is steep, and below 0 it has no slope and a loss hardly
+    above the first."""
+
+    def start(self, stage, tensors):
+        return {}
+
+    def refresh(self, tensors):
+        pass
+
+    def losses(self, tensors, stage, step, rng):
+        beyond = dr.maximum(tensors["x"], 0) - 1
+        return {"distance": 0.1 + dr.mean(dr.select(beyond > 0, 10.0, 1.0) * dr.square(beyond))}
+
+
+def test_a_network_that_dies_is_noticed():
+    """One step far too long ends where nothing moves any more: no median of a block shows it, its steps do."""
+    progress = descend(stages(100.0, Rectifier()), Progress({"x": np.full(len(TARGET), 0.05, np.float32)}))
+    assert progress.notes and np.abs(progress.tensors["x"] - 1).max() < 0.1
+
+
 @pytest.mark.parametrize("fault", ["empty_beyond", "undefined_beyond"])
 def test_lost_surface_and_undefined_loss_are_taken_back(fault):
     """A lost surface and a loss that is not a number are divergence too, whatever the losses were before."""

@@ -27,9 +27,10 @@ from sira_mi.models.optimisation import (
 )
 
 _CHECKPOINT_SECONDS = 10.0
-# A block has diverged when the median of its losses is above this multiple of the stage's lowest. Each step has rays of
-# its own, and weights of the losses may rise: healthy blocks come to 1.2 times the lowest.
-_DIVERGED = 2.0
+# A block has diverged when one of its losses is above this multiple of the stage's lowest. Steps see windows of the
+# photo in turn and rays of their own: those of healthy blocks come to twice the lowest. A block's median would not do:
+# a network that one step has thrown off may come to rest, dead, where it began.
+_DIVERGED = 2.5
 # How often the learning rates of a stage may be halved.
 _MOST_ROLLBACKS = 12
 
@@ -162,9 +163,9 @@ def _run_block(
 ) -> float:
     """Takes some steps from `tensors` on; returns the median of their losses.
 
-    Raises DivergedError when a loss or a parameter is not finite, or the median is far above the lowest of the stage
-    (in the first block, above the loss before the first step) and shorter steps may help; EmptySurfaceError when there
-    is no head before the block or after the stage's last."""
+    Raises DivergedError when a loss or a parameter is not finite, or a loss is far above the lowest of the stage (in
+    the first block, above the loss before the first step) and shorter steps may help; EmptySurfaceError when there is
+    no head before the block or after the stage's last."""
     problem.refresh(tensors)
     totals = []
     for step in steps:
@@ -179,13 +180,12 @@ def _run_block(
     values = parameter_values(optimizer)
     if not all(np.isfinite(value).all() for value in values.values()):
         raise DivergedError("a parameter is not finite")
-    median = float(np.median(totals))
     before = totals[0] if progress.lowest is None else progress.lowest
-    if median > _DIVERGED * before and progress.rollbacks < _MOST_ROLLBACKS:
-        raise DivergedError(f"the loss rose from {before:.3g} to {median:.3g}")
+    if max(totals) > _DIVERGED * before and progress.rollbacks < _MOST_ROLLBACKS:
+        raise DivergedError(f"the loss rose from {before:.3g} to {max(totals):.3g}")
     if steps.stop == stage.steps:
         problem.refresh(tensors | values)
-    return median
+    return float(np.median(totals))
 
 
 def _roll_back(stage: Stage, progress: Progress, error: Exception) -> None:
