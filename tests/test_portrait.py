@@ -24,7 +24,7 @@ from sira_mi.portrait import (
 )
 from sira_mi.portrait.face import LANDMARKS
 from sira_mi.portrait.mask import guided_filter
-from sira_mi.portrait.portrait import area_resample
+from sira_mi.portrait.portrait import Portrait, area_resample, halved
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112
@@ -193,6 +193,21 @@ def test_area_resample_keeps_means_and_positions():
     edges = np.interp(4.3 + np.arange(18) / 0.37, np.arange(54), integral)
     rows = area_resample(image[7:8, :, 0], (4.3, 0), (0.37, 1.0), (17, 1))
     np.testing.assert_allclose(rows[0], np.diff(edges) * 0.37, atol=1e-5)
+
+
+def test_half_a_portrait_shows_the_same():
+    """Odd sizes too: what a pixel pair showed, its half pixel shows, and the camera sees points where they lie now."""
+    rng = np.random.default_rng(0)
+    camera = a_camera(size=(6, 7), focal=40.0)
+    points = rng.uniform(-1, 1, (468, 3))
+    mask = np.ones((7, 6), np.float32)
+    mask[0, 5] = 0
+    image = rng.uniform(size=(7, 6, 3)).astype(np.float32)
+    half = halved(Portrait(image, mask, camera.project(points), camera.project(points), camera, ()))
+    assert half.image.shape == (3, 3, 3) and half.image.mean() == pytest.approx(image.mean(), rel=1e-5)
+    assert half.mask[0, 2] == 0 and half.mask.sum() == 8
+    assert np.allclose(half.camera.project(points), half.landmarks) and np.allclose(half.landmarks, half.head_landmarks)
+    assert np.allclose(half.landmarks, camera.project(points) * [3 / 6, 3 / 7])
 
 
 def test_portrait_of_the_test_photo(photo_file, head, astronaut, mask):

@@ -27,7 +27,7 @@ from sira_mi.fit.settings import (
     GEOMETRY,
     POLISH,
     QUALITIES,
-    RELIEF,
+    SHADING,
     FitSettings,
     polish_stage,
     without,
@@ -245,7 +245,7 @@ def stage_problems(
     from sira_mi.fit.appearance import AppearanceProblem
     from sira_mi.fit.geometry import GeometryProblem
     from sira_mi.fit.polish import PolishProblem
-    from sira_mi.fit.relief import ReliefProblem
+    from sira_mi.fit.shading import ShadingProblem
 
     made: dict[str, object] = {}
 
@@ -269,7 +269,7 @@ def stage_problems(
     return {
         GEOMETRY: of_kind(GEOMETRY, lambda tensors: GeometryProblem(portrait, prior, str(prior_path), settings)),
         APPEARANCE: of_kind(APPEARANCE, on_fitted(partial(AppearanceProblem, plan=plan))),
-        RELIEF: of_kind(RELIEF, on_fitted(ReliefProblem)),
+        SHADING: of_kind(SHADING, on_fitted(ShadingProblem)),
         POLISH: of_kind(POLISH, on_fitted(PolishProblem)),
     }
 

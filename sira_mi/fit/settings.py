@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-GEOMETRY, APPEARANCE, RELIEF, POLISH = "geometry", "appearance", "relief", "polish"
+GEOMETRY, APPEARANCE, SHADING, POLISH = "geometry", "appearance", "shading", "polish"
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class GeometryWeights:
     """Weights of the losses of section 3.2.1 (IDR: colour 1, mask 100 over a sum of BCE / α, eikonal 0.1)."""
 
     color: float = 1.0
+    shading: float = 2.0  # on the colour by eq. 8, in the shading stage
     mask: float = 4.0  # on a mean over rays, in scene units
     eikonal: float = 0.05
     landmark: float = 0.4  # on reprojection errors in face sizes
@@ -46,14 +47,6 @@ class AppearanceWeights:
 
 
 @dataclass(frozen=True)
-class ReliefWeights:
-    """Weights of the losses of the relief stage."""
-
-    anchor: float = 0.2  # on the mean distance to where the surface was, scene units
-    eikonal: float = 0.05
-
-
-@dataclass(frozen=True)
 class PolishSettings:
     """Of the polish stage."""
 
@@ -69,26 +62,26 @@ class FitSettings:
 
     quality: str
     working_size: int  # longest side of the working image, pixels
-    rays: int  # of the geometry stages, a step
+    rays: int  # of the geometry and shading stages, a step
     points: int  # of the eikonal loss, a step
     pixels: int  # of the appearance stages, a step
     voxel: float  # of the mesh during the fit, scene units
     final_voxel: float  # of the exported mesh, scene units
-    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY, APPEARANCE, RELIEF or POLISH, stage), in order
+    stages: tuple[tuple[str, Stage], ...]  # (GEOMETRY, APPEARANCE, SHADING or POLISH, stage), in order
     geometry: GeometryWeights = field(default_factory=GeometryWeights)
     appearance: AppearanceWeights = field(default_factory=AppearanceWeights)
-    relief: ReliefWeights = field(default_factory=ReliefWeights)
     polish: PolishSettings = field(default_factory=PolishSettings)
     learned_radiance: bool = True  # the rendering function starts as the SA-SM has it, at the exposure of its photos
-    shadows: bool = True  # of the head on itself, and light that it reflects onto itself, in the appearance stages
+    shadows: bool = True  # of the head on itself, and light that it reflects onto itself, wherever eq. 8 is
     block: int = 20  # steps between extractions of the mesh; checkpoints fall on them
 
 
-def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tuple[str, Stage], ...]:
+def _stages(geometry: float, appearance: float, shading: int, refinement: float) -> tuple[tuple[str, Stage], ...]:
     """The schedules of sections 3.2.1 and 3.2.2, lengths in proportion to the scales of the geometry stages, of light,
-    albedo and speculars, and of the refinement. Geometry that is fitted for longer follows the photo further from the
-    prior, on some heads away from the person. The rendering function moves from the first step on: one that cannot take
-    the photo's own light puts it down to the shape."""
+    albedo and speculars, and of the refinement; the shading stage has `shading` steps. Geometry that is fitted for
+    longer follows the photo further from the prior, on some heads away from the person. The rendering function moves
+    from the first step on: one that cannot take the photo's own light puts it down to the shape. Once light and albedo
+    are known, the shading stage mends what the learned radiance could not tell of the shape."""
 
     def shape_steps(count: int) -> int:
         return round(count * geometry)
@@ -137,6 +130,17 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
             ),
         ),
         (
+            SHADING,
+            Stage(
+                "shading",
+                shading,
+                {"z_sdf": 6e-3, "deformation": 2e-4},
+                mask_sharpness=120,
+                landmark=0.25,
+                k_s=(1.0, 1.0),
+            ),
+        ),
+        (
             APPEARANCE,
             Stage(
                 "refinement",
@@ -147,16 +151,6 @@ def _stages(geometry: float, appearance: float, refinement: float) -> tuple[tupl
             ),
         ),
     )
-
-
-def with_relief(stages: tuple[tuple[str, Stage], ...], steps: int) -> tuple[tuple[str, Stage], ...]:
-    """The stages with a relief stage of so many steps before the refinement, which no shipped quality has: on rendered
-    portraits it helps normals and albedo, but a real photo's hair, eyes and smile, which the albedo's prior cannot
-    paint, it takes for shape."""
-    rates = {"deformation": 2e-4, "z_l": 1e-2, "illumination": 2e-4, "z_a": 1e-2}
-    stage = Stage("relief", steps, rates, k_s=(1.0, 1.0))
-    first = next(number for number, (_, other) in enumerate(stages) if other.k_r > 0)
-    return (*stages[:first], (RELIEF, stage), *stages[first:])
 
 
 def polish_stage(steps: int = 30) -> tuple[str, Stage]:
@@ -179,7 +173,7 @@ def without(settings: FitSettings, name: str) -> FitSettings:
 
 
 QUALITIES = {
-    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.7, 0.25)),
-    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0, 0.75)),
-    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5, 2.0)),
+    "draft": FitSettings("draft", 256, 1024, 256, 2048, 0.1, 0.06, _stages(0.35, 0.7, 40, 0.25)),
+    "standard": FitSettings("standard", 512, 2048, 512, 4096, 0.08, 0.05, _stages(0.5, 1.0, 60, 0.75)),
+    "high": FitSettings("high", 768, 3072, 768, 8192, 0.06, 0.04, _stages(0.5, 2.5, 60, 2.0)),
 }

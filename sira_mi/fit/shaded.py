@@ -1,4 +1,4 @@
-"""The photo's surface points and their radiance by eq. 8, shared by the stages that fit light, albedo and relief."""
+"""The photo's surface points and their radiance by eq. 8, shared by the stages that fit light, albedo and shape."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One portrait photo to what a fit starts from: linear image, foreground mask, landmarks and camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +112,21 @@ def display_image(image: np.ndarray) -> np.ndarray:
     exposure = 0.8 / bright if bright > 0 and not 0.1 <= bright <= 1.0 else 1.0
     return np.concatenate(
         [(linear_to_srgb(rows * exposure) * 255 + 0.5).astype(np.uint8) for rows in np.array_split(image, 8)]
+    )
+
+
+def halved(portrait: Portrait) -> Portrait:
+    """The portrait at half its size; a pixel is the person's where all of it is."""
+    width, height = (max(1, size // 2) for size in (portrait.camera.width, portrait.camera.height))
+    scale = width / portrait.camera.width, height / portrait.camera.height
+    image, mask = (area_resample(a, (0, 0), scale, (width, height)) for a in (portrait.image, portrait.mask))
+    return replace(
+        portrait,
+        image=image.astype(np.float32),
+        mask=(mask > 0.99).astype(np.float32),
+        landmarks=portrait.landmarks * scale,
+        head_landmarks=portrait.head_landmarks * scale,
+        camera=portrait.camera.scaled(*scale, width, height),
     )
 
 

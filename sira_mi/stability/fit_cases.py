@@ -24,6 +24,7 @@ _STEPS = {
     "light": 20,
     "albedo": 20,
     "speculars": 20,
+    "shading": 20,
     "refinement": 70,
 }
 SETTINGS = replace(

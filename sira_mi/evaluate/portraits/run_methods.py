@@ -17,7 +17,7 @@ from sira_mi.errors import InputError
 from sira_mi.evaluate.cache import fingerprint
 from sira_mi.evaluate.portraits.methods import BY_NAME
 from sira_mi.files import write_through
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, POLISH, RELIEF, FitSettings
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, POLISH, SHADING, FitSettings
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,11 @@ class Job:
     variant: str = "llvm_ad_rgb"
 
     def key(self) -> str:
-        """What the result depends on; weights of a kind of stages count where the method has such a stage."""
+        """What the result depends on; weights of a kind of stages count where the method has such a stage, those of
+        the geometry in the shading stage too."""
         settings = BY_NAME[self.method].settings(self.settings)
-        optional = {GEOMETRY, APPEARANCE, RELIEF, POLISH} - {kind for kind, _ in settings.stages}
+        kinds = {GEOMETRY if kind == SHADING else kind for kind, _ in settings.stages}
+        optional = {GEOMETRY, APPEARANCE, POLISH} - kinds
         used = {name: value for name, value in asdict(settings).items() if name not in optional}
         described = json.dumps([self.method, self.seed, used])
         before = [self.before / "fit.json"] if self.before else []
