@@ -107,7 +107,7 @@ class Rectifier:
 
 def test_a_network_that_dies_is_noticed():
     """One step far too long ends where nothing moves any more: no median of a block shows it, its steps do."""
-    progress = descend(stages(100.0, Rectifier()), Progress({"x": np.full(len(TARGET), 0.05, np.float32)}))
+    progress = descend(stages(160.0, Rectifier()), Progress({"x": np.full(len(TARGET), 0.05, np.float32)}))
     assert progress.notes and np.abs(progress.tensors["x"] - 1).max() < 0.1
 
 

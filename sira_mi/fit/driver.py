@@ -27,9 +27,10 @@ from sira_mi.models.optimisation import (
 )
 
 _CHECKPOINT_SECONDS = 10.0
-# A block has diverged when one of its losses is above this multiple of the stage's lowest. Steps see windows of the
-# photo in turn and rays of their own: those of healthy blocks come to twice the lowest. A block's median would not do:
-# a network that one step has thrown off may come to rest, dead, where it began.
+# A block has diverged when one of its losses is above this multiple of the stage's lowest and its later half has not
+# come below that again. The steps of a healthy block may rise as far (networks that start from 0, windows of the photo
+# in turn), but it ends lower. A block's median alone would not do: a network that one step has thrown off may come to
+# rest, dead, hardly above where it began.
 _DIVERGED = 2.5
 # How often the learning rates of a stage may be halved.
 _MOST_ROLLBACKS = 12
@@ -164,8 +165,8 @@ def _run_block(
     """Takes some steps from `tensors` on; returns the median of their losses.
 
     Raises DivergedError when a loss or a parameter is not finite, or a loss is far above the lowest of the stage (in
-    the first block, above the loss before the first step) and shorter steps may help; EmptySurfaceError when there is
-    no head before the block or after the stage's last."""
+    the first block, above the loss before the first step), the losses stay above it and shorter steps may help;
+    EmptySurfaceError when there is no head before the block or after the stage's last."""
     problem.refresh(tensors)
     totals = []
     for step in steps:
@@ -181,7 +182,8 @@ def _run_block(
     if not all(np.isfinite(value).all() for value in values.values()):
         raise DivergedError("a parameter is not finite")
     before = totals[0] if progress.lowest is None else progress.lowest
-    if max(totals) > _DIVERGED * before and progress.rollbacks < _MOST_ROLLBACKS:
+    stays = np.median(totals[len(totals) // 2 :]) > before
+    if max(totals) > _DIVERGED * before and stays and progress.rollbacks < _MOST_ROLLBACKS:
         raise DivergedError(f"the loss rose from {before:.3g} to {max(totals):.3g}")
     if steps.stop == stage.steps:
         problem.refresh(tensors | values)
