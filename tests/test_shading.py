@@ -16,7 +16,7 @@ from sira_mi.fit.shading import ShadingProblem
 from sira_mi.portrait.portrait import Portrait
 
 SIZE = 64
-STAGE = next(stage for kind, stage in QUALITIES["draft"].stages if kind == SHADING)
+STAGE = next(stage for kind, stage in QUALITIES["standard"].stages if kind == SHADING)
 # Every pixel at every step; shadows, whose edges no derivative sees, have tests of their own.
 SETTINGS = replace(QUALITIES["draft"], rays=SIZE * SIZE, points=64, voxel=0.1, learned_radiance=False, shadows=False)
 

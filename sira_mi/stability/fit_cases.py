@@ -16,7 +16,7 @@ from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.stability.fit_truth import FOCAL_35MM
 
-# A fit that takes half a minute, long enough for its stages to settle.
+# A fit by all stages that takes half a minute, long enough for them to settle.
 _STEPS = {
     "latents": 30,
     "networks": 45,
@@ -37,7 +37,7 @@ SETTINGS = replace(
     voxel=0.12,
     final_voxel=0.1,
     block=10,
-    stages=tuple((kind, replace(stage, steps=_STEPS[stage.name])) for kind, stage in QUALITIES["draft"].stages),
+    stages=tuple((kind, replace(stage, steps=_STEPS[stage.name])) for kind, stage in QUALITIES["standard"].stages),
 )
 REACH = 10  # pixels of the photo by which masks are eroded and dilated
 _HOLES, _HOLE_RADIUS = 12, 18  # number, and pixels

@@ -2,9 +2,9 @@
 
 Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
 deformation and reference, a.4 is SIRA. Appearance, all from the geometry of a.4 on: b.1 has no prior, b.2 the AF-SM and
-its schedule, b.3 is the fit as it ships, with the refinement, b.4 is b.3 without the shading stage, on the surface of
-a.4, b.5 a polish after b.3, b.6 is b.3 without shadows: all light of the upper hemisphere arrives at every point, and
-b.7 gives all that base albedo and light leave of the photo to the albedo, as the paper does.
+its schedule, b.3 is the fit as it ships, with the refinement, b.4 is b.3 with a shading stage, which a draft has not,
+b.5 a polish after b.3, b.6 is b.3 without shadows: all light of the upper hemisphere arrives at every point, and b.7
+gives all that base albedo and light leave of the photo to the albedo, as the paper does.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, FitSettings, Stage, polish_stage
+from sira_mi.fit.settings import APPEARANCE, GEOMETRY, SHADING, FitSettings, Stage, polish_stage, with_shading
 from sira_mi.models.af_sm import initial_appearance_model
 from sira_mi.models.avatar import Avatar
+
+# Of b.4, at draft quality.
+_SHADING_STEPS = 40
 
 Tensors = dict[str, np.ndarray]
 Stages = tuple[tuple[str, Stage], ...]
@@ -95,6 +98,12 @@ def _after_geometry(shipped: Stages) -> Stages:
     return tuple(entry for entry in shipped if entry[0] != GEOMETRY)
 
 
+def _with_shading(shipped: Stages) -> Stages:
+    """Those after the geometry with a shading stage, whether the quality has one or not."""
+    stages = _after_geometry(shipped)
+    return stages if any(kind == SHADING for kind, _ in stages) else with_shading(stages, _SHADING_STEPS)
+
+
 def _without_refinement(shipped: Stages) -> Stages:
     return tuple((kind, stage) for kind, stage in _after_geometry(shipped) if stage.k_r == 0)
 
@@ -132,7 +141,7 @@ METHODS = (
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
     Method("b.3", "with refinement: the shipped fit", _after_geometry, _unchanged, after="a.4"),
-    Method("b.4", "as b.3, without the shading stage", _of_kind(APPEARANCE), _unchanged, after="a.4"),
+    Method("b.4", "as b.3, with a shading stage", _with_shading, _unchanged, after="a.4"),
     Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
     Method("b.6", "as b.3, without shadows", _after_geometry, _unchanged, after="a.4", shadows=False),
     Method("b.7", "as b.3, all of the residual to the albedo", _all_to_the_albedo, _unchanged, after="a.4"),

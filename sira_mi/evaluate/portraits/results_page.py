@@ -15,7 +15,7 @@ from sira_mi.files import write_png, write_through
 from sira_mi.fit import output
 
 SHIPPED = "b.3"
-GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", SHIPPED)
+GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", "b.4")
 FIT_ROWS = (MEAN_HEAD, "a.4", SHIPPED)  # of the shipped fit's geometry, as a.4 and b.3 leave it
 APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5", "b.6", "b.7")
 _TILE = 256  # pixels, side of a picture in the sheet

@@ -6,11 +6,11 @@ The methods of the paper's Figure 4 and four of this project, all at `{quality}`
 without deformation (H3D-Net): a.1 its latent, a.2 its networks as well. a.3 has deformation and reference, and moves
 the deformation's network. In all three the rendering function starts untrained, as in H3D-Net; a.4, where it was
 learned with the shapes, is the fit's geometry. b.1 to b.7 go on from a.4: b.1 with untrained decoders, b.2 without
-the refinement, b.3 as shipped at that quality, b.4 as b.3 but without the
-[shading stage](architecture.md#shape-by-the-light), on the very surface of a.4, b.5 polished by path tracing, b.6 as
-b.3 but with all light of the upper hemisphere at every point: no shadows, and no light that the head reflects onto
-itself. b.7 is b.3 as the paper has it, without a refinement of the light: all that base albedo and light leave of the
-photo goes to the albedo.
+the refinement, b.3 as shipped at that quality, b.4 with the
+[shading stage](architecture.md#shape-by-the-light) of the longer qualities, which moves the surface of a.4 too, b.5
+polished by path tracing, b.6 as b.3 but with all light of the upper hemisphere at every point: no shadows, and no light
+that the head reflects onto itself. b.7 is b.3 as the paper has it, without a refinement of the light: all that base
+albedo and light leave of the photo goes to the albedo.
 A method without a row was left out by `--methods`. Without a reference space, landmarks have no places on heads of
 other shapes: a.1 and a.2 are held by outline and colour alone, and where the outline fits best, the face does least.
 
@@ -163,8 +163,8 @@ GEOMETRY = """Distances in mm from points to the other surface, means over portr
 direction is said. `face` is skin and eyes within 95 mm of the nose tip, after six landmarks and ICP with scale (H3DS);
 `no ICP` is in the photo's camera frame, with one scale about the camera's centre; `head` is everything above the
 shoulders, hair included; `hidden half` is what the photo does not show; IoU leaves out the body below the
-model's floor, 30 cm under the ears. The [shading stage](architecture.md#shape-by-the-light)
-of b.3 moves the surface of a.4."""
+model's floor, 30 cm under the ears. The shading stage of b.3
+moves the surface of a.4."""
 
 APPEARANCE = """Inside the mask, PSNR and SSIM on sRGB values. `eq. 8` is the final render without the
 [refinement of the light](architecture.md#albedo-or-light), which holds in the photo's own light only: what albedo,
