@@ -114,9 +114,13 @@ class GeometryProblem:
             self.landmarks["placed"] = placed_landmarks(field, self.landmarks["x_ref"], self.landmarks["x"])
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
+        return self._losses_of(self._field({**self._fixed, **tensors}), tensors, stage, step, rng)
+
+    def _losses_of(self, field: SdfField, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
+        """The losses of a `field` made once from `tensors`: each further one would add to the parameters' gradient by a
+        scatter of its own, and the sum of three varies with the order of threads."""
         weights = self.settings.geometry
         current = {**self._fixed, **tensors}
-        field = self._field(current)
         color, mask = self._image_losses(tensors, stage, step, rng)
         _, gradient, _, _ = surface(field, self._eikonal_points(rng))
         terms = {

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.appearance import diffuse_albedo
-from sira_mi.fields.sdf import normalised, surface
+from sira_mi.fields.sdf import SdfField, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.fit.geometry import GeometryProblem
 from sira_mi.fit.settings import FitSettings, Stage
@@ -35,16 +35,17 @@ class ShadingProblem(GeometryProblem):
         self._fixed |= {name: mi.Float(v) for name, v in tensors.items() if v.ndim == 1 and name not in self._fixed}
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
-        terms = super().losses(tensors, stage, step, rng)
-        terms["color"] = self.settings.geometry.shading * self._shading_loss({**self._fixed, **tensors}, stage, rng)
+        current = {**self._fixed, **tensors}
+        field = self._field(current)
+        terms = self._losses_of(field, tensors, stage, step, rng)
+        terms["color"] = self.settings.geometry.shading * self._shading_loss(field, current, stage, rng)
         return terms
 
-    def _shading_loss(self, current: dict, stage: Stage, rng: np.random.Generator):
+    def _shading_loss(self, field: SdfField, current: dict, stage: Stage, rng: np.random.Generator):
         """Photometric loss of eq. 8 on pixels drawn from the photo: by the surface's places and normals, which carry
         the derivative, and the light that reaches the points where they were at the last refresh."""
         count = len(self.points.row)
         points = self.points[np.sort(rng.choice(count, min(self.settings.rays, count), replace=False))]
-        field = self._field(current)
         rays = (mi.TensorXf(v) for v in (points.origin, points.view, points.t))
         _, gradient, x_ref, gamma = surface(field, differentiable_hit(field, *rays))
         network = decoder(self.avatar, "diffuse_albedo", current, "z_a")
