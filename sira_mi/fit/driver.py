@@ -28,9 +28,9 @@ from sira_mi.models.optimisation import (
 
 _CHECKPOINT_SECONDS = 10.0
 # A block has diverged when one of its losses is above this multiple of the stage's lowest and its later half has not
-# come below that again. The steps of a healthy block may rise as far (networks that start from 0, windows of the photo
-# in turn), but it ends lower. A block's median alone would not do: a network that one step has thrown off may come to
-# rest, dead, hardly above where it began.
+# come below that again. Healthy steps may rise as far (windows of the photo in turn, networks that start from 0), but
+# blocks hardly ever stay up, and shorter steps then cost little. A block's median alone would not do: a network that
+# one step has thrown off may come to rest, dead, hardly above where it began.
 _DIVERGED = 2.5
 # How often the learning rates of a stage may be halved.
 _MOST_ROLLBACKS = 12

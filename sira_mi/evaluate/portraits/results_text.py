@@ -118,15 +118,16 @@ size. None of this is in the shipped fit.
   1.47 mm. Weaker rates of the deformation's network, or three times the weight of the prior: within 0.06 mm. Half and a
   quarter of the weight of the colour: 1.37 and 1.34 mm, where 1.34 is shipped. Three seeds each of two photos ended
   within 0.14 mm of each other: there is little that a mean over seeds could take out.
-- **Shape by the light**, 60 steps on the nine heads (face 1.25, camera's frame 2.03 mm, normals 11.3° before). Without
-  eq. 8's colour the same steps end at 1.23 mm and 11.7°; with it at weight 1 at 1.14 (twice the network's rate: 1.12),
-  weight 3 at 1.09, 1.79 mm and 10.7°, weight 10 at 1.15. With fewer pixels a step and at half the photo's size, which
-  saves a third of the time, weight 1.5 has 1.13, 1.87 mm and 10.7°, in 40 steps 1.15. At weight 3 the portrait of
-  scikit-image gets a fold under its fringe, at 1.5 and at 2, which is shipped, a fainter one. The shape's latent alone:
-  1.24 mm. Light and albedo moved along: 1.08. The camera too, at weight 1: 1.15, camera's frame 2.00 mm, IoU 0.968: it drifts. Half the
-  steps at twice the rates: 1.14. In place of the last geometry stage: 1.13. The worst fifth of the pixels left out, on
-  the portrait of scikit-image: the fringe bends at its end. On these twelve portraits the gain is less than on the
-  nine: four heads lose (`makehuman_0023_studio` most, 0.94 → 1.12), eight gain.
+- **Shape by the light**, 60 steps on the nine heads (face 1.25, camera's frame 2.03 mm, normals 11.3° before).
+  Without eq. 8's colour the same steps end at 1.23 mm and 11.7°; with it at weight 1 at 1.14 (twice the network's
+  rate: 1.12), weight 3 at 1.09, 1.79 mm and 10.7°, weight 10 at 1.15. With fewer pixels a step and at half the
+  photo's size, which saves a third of the time, weight 1.5 has 1.13, 1.87 mm and 10.7°, in 40 steps 1.15. At weight 3
+  the portrait of scikit-image gets a fold under its fringe, at 1.5 and at 2, which is shipped, a fainter one. The
+  shape's latent alone: 1.24 mm. Light and albedo moved along: 1.08. The camera too, at weight 1: 1.15, camera's frame
+  2.00 mm, IoU 0.968: it drifts. Half the steps at twice the rates: 1.14. In place of the last geometry stage: 1.13.
+  The worst fifth of the pixels left out, on the portrait of scikit-image: the fringe bends at its end. On these
+  twelve portraits the gain is less than on the nine: four heads lose (`makehuman_0023_studio` most, 0.94 → 1.12),
+  eight gain.
 - **Normals.** Errors are largest at eyelids, the wings of the nose, the mouth, ears and the edge of the hair: detail
   that the prior does not have. A relief stage, before there was a shading stage (the deformation's network by eq. 8,
   along the photo's rays, each pixel's albedo and all points held), helped here and the albedo (at `standard`, with 182
