@@ -91,6 +91,8 @@ def test_a_fit_leaves_what_it_is_scored_by(jobs):
     after, _ = read_arrays(jobs[1][0].out / "tensors.safetensors")
     for name in ("pose", "reference", "rendering"):
         assert np.array_equal(before[name], after[name])
+    for name in ("z_sdf", "deformation"):
+        assert not np.array_equal(before[name], after[name])
     assert np.abs(before["pose"]).max() > 0
 
 

@@ -88,15 +88,15 @@ TRIED = """## What was tried against what is missed
 On six other heads of the test split, at `draft`, unless said: few, so that figures show a direction rather than a
 size. None of this is in the shipped fit.
 
-- **The camera's frame.** The landmark model errs by 4° on average on these heads, and hair over a turned face misleads
-  it most: for `makehuman_0199_outdoor` the camera starts 20% too far away, and the head grows with it; since outlines
-  count for more, a.4's face of it is off by 1.71 instead of 1.47 mm, b.3's by 1.55. The photo hardly
-  corrects a camera: with the true one given, two heads still ended at 1.8 and 2.6 mm in its frame and 0.95 and 1.12 mm
-  after ICP, with the same losses as from the estimated one. Three times the pose's learning rate: 1.02 → 1.09 and
-  0.99 → 0.88 mm. A correction of the landmarks' bias by yaw and pitch, learned from 412 views of 100 training heads, or
-  landmarks fitted along with the shape's latents: 4.2° → 4.0° to 4.1°. Landmarks weighted by how much they face the
-  camera: no difference on 416 small views of training heads (7.1° both, distance 6.6% → 6.5%). No landmarks after the
-  first stage: no difference.
+- **The camera's frame.** The landmark model errs by 4° on average on these heads, and hair over a turned face
+  misleads it most: for `makehuman_0199_outdoor` the camera starts 20% too far away, and the head grows with it; since
+  outlines count for more, a.4's face of it is off by 1.71 instead of 1.47 mm, b.3's by 1.55. The photo hardly
+  corrects a camera: with the true one given, two heads still ended at 1.8 and 2.6 mm in its frame and 0.95 and 1.12
+  mm after ICP, with the same losses as from the estimated one. Three times the pose's learning rate: 1.02 → 1.09 and
+  0.99 → 0.88 mm. A correction of the landmarks' bias by yaw and pitch, learned from 412 views of 100 training heads,
+  or landmarks fitted along with the shape's latents: 4.2° → 4.0° to 4.1°. Landmarks weighted by how much they face
+  the camera: no difference on 416 small views of training heads (7.1° both, distance 6.6% → 6.5%). No landmarks after
+  the first stage: no difference.
 - **An alignment stage** of latents, pose and rendering function, at a quarter of the landmarks' weight, after the first
   (35 to 70 steps, same nine heads): IoU 0.967 → 0.972 to 0.974, camera's frame 2.18 → 2.06 to 2.12, face 1.26 → 1.24 to
   1.27, but head 5.8 → 6.2 to 6.4 and hidden half 7.2 → 7.7 to 8.0; and on the portrait of scikit-image the smile, which
@@ -118,16 +118,16 @@ size. None of this is in the shipped fit.
   1.47 mm. Weaker rates of the deformation's network, or three times the weight of the prior: within 0.06 mm. Half and a
   quarter of the weight of the colour: 1.37 and 1.34 mm, where 1.34 is shipped. Three seeds each of two photos ended
   within 0.14 mm of each other: there is little that a mean over seeds could take out.
-- **Shape by the light**, 60 steps on the nine heads (face 1.25, camera's frame 2.03 mm, normals 11.3° before).
-  Without eq. 8's colour the same steps end at 1.23 mm and 11.7°; with it at weight 1 at 1.14 (twice the network's
-  rate: 1.12), weight 3 at 1.09, 1.79 mm and 10.7°, weight 10 at 1.15. With fewer pixels a step and at half the
-  photo's size, which saves a third of the time, weight 1.5 has 1.13, 1.87 mm and 10.7°, in 40 steps 1.15. At weight 3
-  the portrait of scikit-image gets a fold under its fringe, at 1.5 and at 2, which is shipped, a fainter one. The
-  shape's latent alone: 1.24 mm. Light and albedo moved along: 1.08. The camera too, at weight 1: 1.15, camera's frame
-  2.00 mm, IoU 0.968: it drifts. Half the steps at twice the rates: 1.14. In place of the last geometry stage: 1.13.
-  The worst fifth of the pixels left out, on the portrait of scikit-image: the fringe bends at its end. On these
-  twelve portraits the gain is less than on the nine: four heads lose (`makehuman_0023_studio` most, 0.94 → 1.12),
-  eight gain.
+- **Other ways to the shape by the light**, 60 steps on the nine heads (face 1.25, camera's frame 2.03 mm, normals
+  11.3° before). Without eq. 8's colour the same steps end at 1.23 mm and 11.7°; with it at weight 1 at 1.14 (twice
+  the network's rate: 1.12), weight 3 at 1.09, 1.79 mm and 10.7°, weight 10 at 1.15. With fewer pixels a step and at
+  half the photo's size, which saves a third of the time, weight 1.5 has 1.13, 1.87 mm and 10.7°, in 40 steps 1.15. At
+  weight 3 the portrait of scikit-image gets a fold under its fringe, at 1.5 and at 2, which is shipped, a fainter
+  one. The shape's latent alone: 1.24 mm. Light and albedo moved along: 1.08. The camera too, at weight 1: 1.15,
+  camera's frame 2.00 mm, IoU 0.968: it drifts. Half the steps at twice the rates: 1.14. In place of the last geometry
+  stage: 1.13. The worst fifth of the pixels left out, on the portrait of scikit-image: the fringe bends at its end.
+  On these twelve portraits the gain is less than on the nine: four heads lose (`makehuman_0023_studio` most, 0.94 →
+  1.12), eight gain.
 - **Normals.** Errors are largest at eyelids, the wings of the nose, the mouth, ears and the edge of the hair: detail
   that the prior does not have. A relief stage, before there was a shading stage (the deformation's network by eq. 8,
   along the photo's rays, each pixel's albedo and all points held), helped here and the albedo (at `standard`, with 182
