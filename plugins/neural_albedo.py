@@ -1,6 +1,7 @@
 import drjit as dr
 import mitsuba as mi
 
+from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.appearance import (
     albedo_refinement,
@@ -13,7 +14,6 @@ from sira_mi.fields.appearance import (
     specular_albedo_cooperative,
 )
 from sira_mi.fields.mlp import layers, pack
-from sira_mi.models.avatar import load_avatar
 
 
 def find_avatar(props, name: str = "avatar") -> str:

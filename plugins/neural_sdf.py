@@ -2,11 +2,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import load_avatar, signed_distance_field
 from sira_mi.fields import tracing
 from sira_mi.fields.columns import scatter_columns, to_columns
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, rigid_motion, signed_distance, surface
-from sira_mi.models.avatar import load_avatar, signed_distance_field
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 

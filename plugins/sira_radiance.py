@@ -1,13 +1,13 @@
 import drjit as dr
 import mitsuba as mi
 
+from sira_mi.avatar.file import load_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import normalised, signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit, refined_approach
-from sira_mi.models.avatar import load_avatar
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 

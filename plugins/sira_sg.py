@@ -2,19 +2,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.appearance import light_refinement
 from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
-from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
-from sira_mi.models.avatar import load_avatar
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg import multisampling, visibility
+from sira_mi.sg.radiance import diffuse_radiance, physical_radiance
 
 # Rows of the columns that are computed at a hit, in order.
 _ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}

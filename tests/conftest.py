@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import skimage.data
 
+from sira_mi.avatar.file import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.fit.settings import QUALITIES, FitSettings
-from sira_mi.models.avatar import LANDMARKS, Avatar, AvatarArchitecture, save_avatar
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.face import find_faces
 

@@ -4,10 +4,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sira_mi.evaluate.portraits.alignment import SIX_LANDMARKS
-from sira_mi.evaluate.portraits.truth import Truth
-from sira_mi.evaluate.portraits.visible_surface import mesh_images
 from sira_mi.portrait.camera import Camera
+from studies.portraits.alignment import SIX_LANDMARKS
+from studies.portraits.truth import Truth
+from studies.portraits.visible_surface import mesh_images
 
 SKIN, HAIR, CLOTH, NOTHING = 0, 1, 3, 255
 SIZE = 64

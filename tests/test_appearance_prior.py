@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 from conftest import SMALL, small_avatar
 
+from sira_mi.avatar import skin_tone
+from sira_mi.avatar.file import LANDMARKS
 from sira_mi.conventions import HELD_OUT_VIEWS, LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate.priors import appearance_prior as ap
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope
-from sira_mi.models import af_sm, skin_tone
-from sira_mi.models.avatar import LANDMARKS
-from sira_mi.models.prior import assemble_prior
-from sira_mi.models.scenes import TrainingScene
 from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.training import af_sm
+from sira_mi.training.prior import assemble_prior
+from sira_mi.training.scenes import TrainingScene
+from studies.priors import appearance_prior as ap
 
 SETTINGS = af_sm.AppearanceTraining(frozen_points=400)
 

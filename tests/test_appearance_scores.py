@@ -7,8 +7,8 @@ import pytest
 from egg import CLOTH, SIZE, head_like, truth_of
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits.appearance_scores import PredictedAppearance, score_appearance
-from sira_mi.evaluate.portraits.truth import Truth
+from studies.portraits.appearance_scores import PredictedAppearance, score_appearance
+from studies.portraits.truth import Truth
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 from conftest import SMALL
 from safetensors.numpy import save
 
+from sira_mi.avatar.file import FORMAT, Avatar, AvatarArchitecture, load_avatar, save_avatar
 from sira_mi.errors import InputError
-from sira_mi.models.avatar import FORMAT, Avatar, AvatarArchitecture, load_avatar, save_avatar
 
 
 def description(**changes) -> dict:

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from sira_mi.collection import skin
-from sira_mi.collection.lighting import lobe_map, map_directions
-from sira_mi.collection.render import Part, RenderSettings, build_scene, project, render_views
-from sira_mi.collection.sources.makehuman import MakeHumanSource
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits import benchmark
-from sira_mi.evaluate.portraits.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
-from sira_mi.evaluate.portraits.benchmark_plan import (
+from sira_mi.portrait.camera import focal_from_exif
+from sira_mi.portrait.load import linear_to_srgb, load_photo
+from sira_mi.training.collection import skin
+from sira_mi.training.collection.lighting import lobe_map, map_directions
+from sira_mi.training.collection.render import Part, RenderSettings, build_scene, project, render_views
+from sira_mi.training.collection.sources.makehuman import MakeHumanSource
+from studies.portraits import benchmark
+from studies.portraits.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
+from studies.portraits.benchmark_plan import (
     BenchmarkSettings,
     Identity,
     choose_identities,
@@ -28,10 +30,8 @@ from sira_mi.evaluate.portraits.benchmark_plan import (
     named_sources,
     plan,
 )
-from sira_mi.evaluate.portraits.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
-from sira_mi.evaluate.portraits.truth import load_truth
-from sira_mi.portrait.camera import focal_from_exif
-from sira_mi.portrait.load import linear_to_srgb, load_photo
+from studies.portraits.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
+from studies.portraits.truth import load_truth
 
 TINY = PhotoSettings(size=48, samples=16, depth=3, shading_samples=64)
 EVEN = {code: 0.5 for code in range(4)}

@@ -11,13 +11,13 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sira_mi.collection import build as building
-from sira_mi.collection import hair, landmarks, look, makehuman, outer, person, render, scene, skin, surface
-from sira_mi.collection.annotate_landmarks import attach, symmetrise
-from sira_mi.collection.sources.makehuman import MakeHumanSource
-from sira_mi.collection.subject import BrokenHead
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMINANCE
 from sira_mi.errors import InputError
+from sira_mi.training.collection import build as building
+from sira_mi.training.collection import hair, landmarks, look, makehuman, outer, person, render, scene, skin, surface
+from sira_mi.training.collection.annotate_landmarks import attach, symmetrise
+from sira_mi.training.collection.sources.makehuman import MakeHumanSource
+from sira_mi.training.collection.subject import BrokenHead
 
 SMALL = scene.SceneSettings(points=1500, volume=1200, render=render.RenderSettings(size=48, samples=4))
 

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from conftest import camera
 
-from sira_mi import scene as scenes
-from sira_mi.crosscheck import causes, curves, forms, images, page, speed
-from sira_mi.crosscheck.__main__ import _command, main
-from sira_mi.crosscheck.case import Case, load_case
-from sira_mi.crosscheck.fits import read_fits
-from sira_mi.crosscheck.lights import SETTINGS, SOFT, lobes_of
-from sira_mi.crosscheck.points import field_points, in_double, mesh_points
-from sira_mi.crosscheck.regions import HEAD, REGIONS, SILHOUETTE, regions
-from sira_mi.crosscheck.run import Settings, measure
+from sira_mi.export import scene as scenes
+from studies.crosscheck import causes, curves, forms, images, page, speed
+from studies.crosscheck.__main__ import _command, main
+from studies.crosscheck.case import Case, load_case
+from studies.crosscheck.fits import read_fits
+from studies.crosscheck.lights import SETTINGS, SOFT, lobes_of
+from studies.crosscheck.points import field_points, in_double, mesh_points
+from studies.crosscheck.regions import HEAD, REGIONS, SILHOUETTE, regions
+from studies.crosscheck.run import Settings, measure
 from sira_mi.errors import InputError
 
 pytest.importorskip("flip_evaluator")
@@ -208,7 +208,7 @@ def test_a_tiny_run_writes_the_page(case, tmp_path):
     rows = tmp_path / "draft" / "rows.json"
     rows.parent.mkdir()
     rows.write_text(json.dumps(fit_rows()))
-    written = page.write_page(tmp_path, measured, read_fits([rows]), "python -m sira_mi.crosscheck --size 20")
+    written = page.write_page(tmp_path, measured, read_fits([rows]), "python -m studies.crosscheck --size 20")
     text = written.read_text(encoding="utf-8")
     assert "--size 20" in text and "time over before" in text and "| draft | 2 | 30 | 1.50 | 31.0 |" in text
     assert all(f"({name}" in text for name in ("images/crosscheck_curves.svg", "images/crosscheck_causes.png"))
@@ -304,7 +304,7 @@ def test_bad_command_lines_end_in_one_line(arguments, message, tmp_path, monkeyp
 
 def test_the_command_of_the_page_leaves_folders_out():
     arguments = ["a.xml", "--out", "x", "--size", "64", "--evidence=y", "--lights", "soft studio"]
-    assert _command(arguments) == "python -m sira_mi.crosscheck a.xml --size 64 --lights 'soft studio'"
+    assert _command(arguments) == "python -m studies.crosscheck a.xml --size 64 --lights 'soft studio'"
 
 
 def test_rows_of_fits_that_are_none(tmp_path):
@@ -316,7 +316,7 @@ def test_rows_of_fits_that_are_none(tmp_path):
 
 
 def test_plots_say_which_extra_is_missing(monkeypatch):
-    from sira_mi.crosscheck import plots
+    from studies.crosscheck import plots
 
     for module in ("matplotlib", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, module, None)

@@ -33,7 +33,7 @@ def test_links_and_equation_table_point_at_what_exists():
 
 def test_the_collection_page_lists_the_arrays_of_a_scene():
     """The table of `docs/collection.md` is `LAYOUT`."""
-    from sira_mi.collection.scene import LAYOUT
+    from sira_mi.training.collection.scene import LAYOUT
 
     page = (ROOT / "docs" / "collection.md").read_text(encoding="utf-8")
     for name, content in LAYOUT.items():

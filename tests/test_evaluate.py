@@ -11,20 +11,19 @@ import pytest
 from conftest import SMALL, small_avatar
 from test_training import SIZES, ball_collection
 
-from sira_mi import train
 from sira_mi.errors import InputError
-from sira_mi.evaluate import __main__ as command
-from sira_mi.evaluate.cache import cached, fingerprint, read
-from sira_mi.evaluate.priors import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
-from sira_mi.evaluate.priors.appearance_prior import LatentFit
-from sira_mi.evaluate.priors.shape_prior import Scan, ShapeFit
 from sira_mi.fields.appearance import rendered_radiance
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
-from sira_mi.models import pictures
-from sira_mi.models.pictures import extracted_surface
-from sira_mi.models.scenes import TrainingScene
-from sira_mi.models.shape_model import ShapeModel
+from sira_mi.training import pictures, train
+from sira_mi.training.pictures import extracted_surface
+from sira_mi.training.scenes import TrainingScene
+from sira_mi.training.shape_model import ShapeModel
+from studies.cache import cached, fingerprint, read
+from studies.priors import __main__ as command
+from studies.priors import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
+from studies.priors.appearance_prior import LatentFit
+from studies.priors.shape_prior import Scan, ShapeFit
 
 
 @pytest.fixture(scope="module")

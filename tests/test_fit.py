@@ -13,11 +13,11 @@ import trimesh
 from conftest import tiny_fit
 from PIL import Image
 
+from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
 from sira_mi.fit.rays import modelled_pixels, pixel_rays
-from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.portrait.camera import Camera
 
 TINY = tiny_fit(steps=6)

@@ -14,6 +14,7 @@ import skimage.data
 from conftest import tiny_fit
 from PIL import Image
 
+from sira_mi.avatar.file import PRIOR, load_avatar, save_avatar
 from sira_mi.errors import InputError, run_command
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fit import driver
@@ -21,8 +22,7 @@ from sira_mi.fit.__main__ import main
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.fit import FitRequest, fit_portrait, initial_tensors, read_portrait
 from sira_mi.fit.settings import Stage
-from sira_mi.models.avatar import PRIOR, load_avatar, save_avatar
-from sira_mi.models.optimisation import adam
+from sira_mi.optimisation.adam import adam
 from sira_mi.portrait.face import find_faces
 
 pytestmark = pytest.mark.usefixtures("variant")

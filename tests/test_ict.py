@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from sira_mi.collection import ict, registration
-from sira_mi.collection.ict import ict_control, sample_coefficients
-from sira_mi.collection.makehuman import BODY_VERTICES, LEFT_EYE, Identity, identity_vertices, load_pack
-from sira_mi.collection.skin import rest_surface
-from sira_mi.collection.surface import eye_spheres, head_surface, refine_attribute, refinement, unit_eye
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.training.collection import ict, registration
+from sira_mi.training.collection.ict import ict_control, sample_coefficients
+from sira_mi.training.collection.makehuman import BODY_VERTICES, LEFT_EYE, Identity, identity_vertices, load_pack
+from sira_mi.training.collection.skin import rest_surface
+from sira_mi.training.collection.surface import eye_spheres, head_surface, refine_attribute, refinement, unit_eye
 
 WOMAN = Identity(25.0, 0.2, (0.1, 0.7, 0.2), 0.4, 0.6, 0.4, {"head/head-oval": 0.4, "nose/nose-scale-horiz-incr": 0.3})
 COEFFICIENTS = np.array([1.5, -2.0, 1.0])

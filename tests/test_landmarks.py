@@ -10,11 +10,9 @@ import pytest
 from conftest import SMALL, one_line, small_avatar
 from safetensors.numpy import load_file, save_file
 
+from sira_mi.avatar.file import load_avatar, save_avatar
+from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits.landmark_errors import Observation, fitted_correction, held_out_errors
-from sira_mi.evaluate.priors import landmark_places
-from sira_mi.models.avatar import load_avatar, save_avatar
-from sira_mi.models.landmark_model import LandmarkModel, landmark_tensors, landmarks_of
 from sira_mi.portrait.face import LANDMARKS, Face
 from sira_mi.portrait.head_landmarks import (
     LandmarkCorrection,
@@ -24,6 +22,9 @@ from sira_mi.portrait.head_landmarks import (
     shipped_correction,
     upright_axes,
 )
+from sira_mi.training.landmark_regression import landmark_tensors
+from studies.portraits.landmark_errors import Observation, fitted_correction, held_out_errors
+from studies.priors import landmark_places
 
 MEAN = np.random.default_rng(11).uniform(-0.5, 0.5, (LANDMARKS, 3))
 MEAN[[33, 263]] = (-0.2, -0.1, -0.2), (0.2, -0.1, -0.2)
@@ -173,7 +174,7 @@ def test_landmarks_of_a_head_lie_where_its_field_has_the_mean_heads(prior):
     """At zero latents they are the mean head's; at others the deformation takes both to one place in reference
     space."""
     from sira_mi.fields.sdf import deform
-    from sira_mi.models.shape_model import ShapeModel
+    from sira_mi.training.shape_model import ShapeModel
 
     model = ShapeModel.of_prior(prior)
     zero = np.zeros(SMALL.sdf_latent, np.float32)

@@ -9,13 +9,13 @@ import skimage.data
 from conftest import tiny_fit
 from PIL import Image
 
+from sira_mi.avatar.file import PRIOR
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits import fits, results_page, run_methods
-from sira_mi.evaluate.portraits.methods import BY_NAME, METHODS
-from sira_mi.evaluate.portraits.run_methods import Job, run
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, SHADING
-from sira_mi.models.avatar import PRIOR
-from sira_mi.models.optimisation import read_arrays
+from sira_mi.optimisation.adam import read_arrays
+from studies.portraits import fits, results_page, run_methods
+from studies.portraits.methods import BY_NAME, METHODS
+from studies.portraits.run_methods import Job, run
 
 DRAFT = QUALITIES["draft"]
 

@@ -13,8 +13,8 @@ from conftest import SMALL
 
 from sira_mi.errors import InputError
 from sira_mi.fields.mlp import evaluate, layers
-from sira_mi.models import af_sm, losses, sa_sm
-from sira_mi.models.optimisation import (
+from sira_mi.optimisation import losses
+from sira_mi.optimisation.adam import (
     adam,
     optimizer_state,
     parameter_values,
@@ -22,9 +22,10 @@ from sira_mi.models.optimisation import (
     restore_optimizer,
     write_arrays,
 )
-from sira_mi.models.prior import assemble_prior, whitened, whitening
-from sira_mi.models.scenes import TrainingScene, load_scene, load_training_scenes
-from sira_mi.models.training import run_training
+from sira_mi.training import af_sm, sa_sm
+from sira_mi.training.loop import run_training
+from sira_mi.training.prior import assemble_prior, whitened, whitening
+from sira_mi.training.scenes import TrainingScene, load_scene, load_training_scenes
 
 
 def number(tensor) -> float:
@@ -328,7 +329,7 @@ def test_the_whitened_network_takes_standard_normal_latents(name):
 
 
 def test_the_assembled_prior_is_an_avatar(shape, appearance, two_scenes, tmp_path):
-    from sira_mi.models.avatar import load_avatar, save_avatar
+    from sira_mi.avatar.file import load_avatar, save_avatar
 
     landmarks = np.stack([scene.landmarks for scene in two_scenes])
     landmarks[0, 3] = np.nan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import camera
 
-from sira_mi import scene as scenes
+from sira_mi.export import scene as scenes
 from sira_mi.sg.multisampling import REACH, leaders
 
 UP = np.array([[0.0], [0.0], [1.0]])

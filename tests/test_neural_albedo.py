@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import camera, slopes
 
-from sira_mi import scene as scenes
+from sira_mi.export import scene as scenes
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, deform
 from sira_mi.plugins.neural_albedo import NeuralAlbedo

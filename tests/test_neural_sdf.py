@@ -10,8 +10,8 @@ import trimesh
 from conftest import camera, slopes
 from scipy.spatial.transform import Rotation
 
-from sira_mi import scene as scenes
 from sira_mi.errors import InputError
+from sira_mi.export import scene as scenes
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
 
@@ -201,7 +201,7 @@ def test_a_new_extraction_changes_the_picture_as_the_derivative_says(avatar, ava
 
 
 def test_sixty_updates_leave_no_memory_behind(avatar, avatar_path):
-    """The full 500 are in benchmarks/remesh_updates.py."""
+    """The full 500 are in studies/numerics/remesh_updates.py."""
     scene = build(avatar_path, camera(18), voxel=0.25)
     params = mi.traverse(scene)
     rng = np.random.default_rng(0)

@@ -12,27 +12,28 @@ import numpy as np
 import pytest
 from conftest import camera, small_avatar, tiny_fit
 
+from sira_mi.avatar.file import PRIOR, load_avatar, save_avatar
+from sira_mi.decisions import Decision, Plan, explain
 from sira_mi.errors import InputError
+from sira_mi.export.scene import orbited
 from sira_mi.fit.driver import Progress, run_stages
 from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
+from sira_mi.fit.leave_out import plan_fit
+from sira_mi.fit.measure import measured_fit
 from sira_mi.fit.settings import APPEARANCE
-from sira_mi.models.avatar import PRIOR, load_avatar, save_avatar
-from sira_mi.plan import measure
-from sira_mi.plan.decisions import Decision, Plan, explain
-from sira_mi.plan.fit import plan_fit
-from sira_mi.plan.measure import measured, measured_fit
-from sira_mi.plan.page import commands, plan_table
-from sira_mi.plan.relight import TOLERANCE, image_lobes, largest_reflectance, plan_relight
-from sira_mi.plan.surface import Surface, bounced_radiance, sample_surface
+from sira_mi.relight import measure
 from sira_mi.relight.__main__ import main as relight
+from sira_mi.relight.leave_out import TOLERANCE, image_lobes, largest_reflectance, plan_relight
+from sira_mi.relight.measure import measured
 from sira_mi.relight.render import RelightSettings, head_window, load_head, render_passes, turned_scene
 from sira_mi.relight.subject import Light, Subject
-from sira_mi.scene import orbited
+from sira_mi.relight.surface import Surface, bounced_radiance, sample_surface
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
 from sira_mi.sg.lobes import fibonacci_directions
 from sira_mi.sg.shading import shade_tensor
 from sira_mi.sg.weak_lobes import needed_lobes, radiance_bounds, white_radiance
+from studies.leave_out.page import commands, plan_table
 
 # A key, a dome and three lobes that are far too dim to be seen.
 LOBES = np.array(

@@ -13,7 +13,7 @@ from conftest import camera, slopes, tiny_fit
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, run_stages
 from sira_mi.fit.settings import PolishSettings, polish_stage
-from sira_mi.models.optimisation import read_arrays
+from sira_mi.optimisation.adam import read_arrays
 from sira_mi.portrait.portrait import Portrait
 
 BLOB = dataclasses.replace(tiny_fit(steps=2), polish=PolishSettings(size=32, samples=64))

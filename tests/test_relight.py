@@ -13,17 +13,17 @@ import pytest
 from conftest import camera, small_avatar
 from PIL import Image
 
+from sira_mi.avatar.file import save_avatar
 from sira_mi.errors import InputError
+from sira_mi.export.scene import head, sensor
 from sira_mi.fields.sdf import deform, evaluate_in_chunks
 from sira_mi.files import write_exr
-from sira_mi.models.avatar import save_avatar
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module
 from sira_mi.relight.__main__ import main
 from sira_mi.relight.compare import compare
 from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
 from sira_mi.relight.subject import Light, Subject, read_light, read_subject
-from sira_mi.scene import head, sensor
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import camera
 
-from sira_mi.models.avatar import PRIOR, load_avatar
+from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.portrait.landmarks import EYES, LIPS
 from sira_mi.portrait.portrait import Portrait
 

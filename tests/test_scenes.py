@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import camera
 
+from sira_mi.avatar.file import load_avatar
 from sira_mi.fit.output import write_scene
-from sira_mi.models.avatar import load_avatar
 from sira_mi.sg.lights_io import read_lights, write_lights
 
 SCENES = Path(__file__).parent.parent / "scenes"

@@ -9,10 +9,10 @@ import trimesh
 from egg import HAIR, SIZE, SKIN, head_like, landmarks_on, truth_of, turned_camera
 from scipy.spatial.transform import Rotation
 
-from sira_mi.collection.annotation import Similarity
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits.alignment import Icp, distances_from, icp, inverse
-from sira_mi.evaluate.portraits.geometry_scores import (
+from sira_mi.training.collection.annotation import Similarity
+from studies.portraits.alignment import Icp, distances_from, icp, inverse
+from studies.portraits.geometry_scores import (
     GeometrySettings,
     PredictedHead,
     score_geometry,
@@ -20,9 +20,9 @@ from sira_mi.evaluate.portraits.geometry_scores import (
     silhouette_iou,
     true_surface,
 )
-from sira_mi.evaluate.portraits.surface_distance import TriangleTree, nearest_reference
-from sira_mi.evaluate.portraits.truth import Truth
-from sira_mi.evaluate.portraits.visible_surface import even_samples, mesh_images, outer_surface
+from studies.portraits.surface_distance import TriangleTree, nearest_reference
+from studies.portraits.truth import Truth
+from studies.portraits.visible_surface import even_samples, mesh_images, outer_surface
 
 QUICK = GeometrySettings(samples=4000, icp_points=1500)
 

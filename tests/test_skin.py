@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from conftest import camera
 
+from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.fit import initial_tensors
 from sira_mi.fit.settings import QUALITIES
-from sira_mi.models.af_sm import AppearanceTraining
-from sira_mi.models.avatar import PRIOR, load_avatar
 from sira_mi.portrait.portrait import Portrait
+from sira_mi.training.af_sm import AppearanceTraining
 
 SIZE = 128
 EYES = (33, 246, 161, 160, 159, 158, 157, 173, 133, 155, 154, 153, 145, 144, 163, 7)  # around the right one

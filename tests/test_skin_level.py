@@ -6,10 +6,10 @@ from egg import SIZE, SKIN, head_like, landmarks_on, truth_of
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.evaluate import __main__ as command
-from sira_mi.evaluate.portraits import skin_level
-from sira_mi.evaluate.portraits.skin_level import Observation, estimate, true_luminance
 from sira_mi.fit.skin import Eye, SkinCues
+from studies.portraits import __main__ as command
+from studies.portraits import skin_level
+from studies.portraits.skin_level import Observation, estimate, true_luminance
 
 
 def observations(noise: float, heads: int = 40, lights: int = 3, misleading: float = 0.2) -> list[Observation]:

@@ -14,18 +14,18 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sira_mi.collection import annotation, skin
-from sira_mi.collection.annotation import Similarity, align, axis_turns, check_landmarks, mean_head
-from sira_mi.collection.landmarks import mesh_landmarks
-from sira_mi.collection.person import make_person
-from sira_mi.collection.sheet import encode_srgb
-from sira_mi.collection.sources import meshes, valid
-from sira_mi.collection.sources.meshes import MeshSource
-from sira_mi.collection.sources.valid import ValidSource, group_of
-from sira_mi.collection.subject import BrokenHead
-from sira_mi.collection.surface import BODY_FLOOR
-from sira_mi.collection.textured_surface import Surface, close_borders, place_index, refine
 from sira_mi.errors import InputError
+from sira_mi.training.collection import annotation, skin
+from sira_mi.training.collection.annotation import Similarity, align, axis_turns, check_landmarks, mean_head
+from sira_mi.training.collection.landmarks import mesh_landmarks
+from sira_mi.training.collection.person import make_person
+from sira_mi.training.collection.sheet import encode_srgb
+from sira_mi.training.collection.sources import meshes, valid
+from sira_mi.training.collection.sources.meshes import MeshSource
+from sira_mi.training.collection.sources.valid import ValidSource, group_of
+from sira_mi.training.collection.subject import BrokenHead
+from sira_mi.training.collection.surface import BODY_FLOOR
+from sira_mi.training.collection.textured_surface import Surface, close_borders, place_index, refine
 
 SEED = 5000
 

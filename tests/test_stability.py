@@ -11,10 +11,10 @@ import sira_mi.sg.integrals as integrals
 from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, surface
-from sira_mi.stability.fields64 import Field64
-from sira_mi.stability.page import Measured, load_rows, page, write_page
-from sira_mi.stability.rows import Row, Section, largest, relative_error
-from sira_mi.stability.sections import SECTIONS
+from studies.stability.fields64 import Field64
+from studies.stability.page import Measured, load_rows, page, write_page
+from studies.stability.rows import Row, Section, largest, relative_error
+from studies.stability.sections import SECTIONS
 
 MEASURES = [measure for section in SECTIONS.values() for measure in section.measures]
 

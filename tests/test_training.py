@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from conftest import SMALL
 
-from sira_mi import train
+from sira_mi.avatar.file import AvatarArchitecture, load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import signed_distance, surface
-from sira_mi.models import af_sm, pictures, sa_sm, training
-from sira_mi.models.avatar import AvatarArchitecture, load_avatar
-from sira_mi.models.optimisation import adam, read_arrays
-from sira_mi.models.scenes import load_training_scenes
-from sira_mi.models.shape_model import ShapeModel
-from sira_mi.models.training import run_training, trained_parameters
+from sira_mi.optimisation.adam import adam, read_arrays
+from sira_mi.training import af_sm, pictures, sa_sm, train
+from sira_mi.training import loop as training
+from sira_mi.training.loop import run_training, trained_parameters
+from sira_mi.training.scenes import load_training_scenes
+from sira_mi.training.shape_model import ShapeModel
 
 SIZES = dataclasses.asdict(SMALL)
 

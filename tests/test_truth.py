@@ -7,7 +7,7 @@ import pytest
 from egg import SIZE, head_like, truth_of
 
 from sira_mi.errors import InputError
-from sira_mi.evaluate.portraits.truth import Truth, load_truth
+from studies.portraits.truth import Truth, load_truth
 
 
 @pytest.fixture(scope="module")

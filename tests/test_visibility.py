@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import camera
 
-from sira_mi import scene as scenes
+from sira_mi.export import scene as scenes
 from sira_mi.errors import InputError
 from sira_mi.sg import visibility
 from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions

@@ -5,17 +5,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import Avatar
+from sira_mi.decisions import Plan
 from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, light_refinement, refined_albedo
 from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fields.sdf import evaluate_in_chunks, in_three
+from sira_mi.fit.leave_out import BASE_ALBEDO, SPECULARS, plan_fit
 from sira_mi.fit.residual import albedo_shares, albedo_variances, light_variances, log_residual, share_loss
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import PhotoPoints, base_albedo, decoder, photo_points, shade_points
 from sira_mi.fit.skin import skin_patches
-from sira_mi.models import losses
-from sira_mi.models.avatar import Avatar
-from sira_mi.plan.decisions import Plan
-from sira_mi.plan.fit import BASE_ALBEDO, SPECULARS, plan_fit
+from sira_mi.optimisation import losses
 from sira_mi.portrait.portrait import Portrait
 
 # ε of the smoothness of the refinement, scene units.

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fit.settings import Stage
-from sira_mi.models.optimisation import (
+from sira_mi.optimisation.adam import (
     adam,
     optimizer_state,
     parameter_values,

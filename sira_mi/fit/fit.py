@@ -17,10 +17,14 @@ import mitsuba as mi
 import numpy as np
 
 import sira_mi
+from sira_mi.avatar.file import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.decisions import Plan, explain
 from sira_mi.errors import InputError
+from sira_mi.export.scene import orbited
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
+from sira_mi.fit.leave_out import plan_fit
 from sira_mi.fit.rays import modelled_pixels
 from sira_mi.fit.settings import (
     APPEARANCE,
@@ -32,14 +36,12 @@ from sira_mi.fit.settings import (
     polish_stage,
     without,
 )
-from sira_mi.models.avatar import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
-from sira_mi.plan.decisions import Plan, explain
-from sira_mi.plan.fit import plan_fit
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
-from sira_mi.scene import orbited
+from sira_mi.relight.pictures import preview, psnr_inside
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
+from sira_mi.variants import set_variant
 
 # Files of an unfinished fit, inside the output folder.
 _WORK = ".fit"
@@ -126,7 +128,7 @@ def fit_photo(request: FitRequest) -> int:
         "versions": {"sira_mi": sira_mi.__version__, **{p: version(p) for p in ("mitsuba", "drjit", "numpy")}},
     }
     if request.explain and not interrupted:
-        from sira_mi.plan.measure import measured_fit
+        from sira_mi.fit.measure import measured_fit
 
         problem = stage_problems(portrait, prior, prior_path, work, settings)[APPEARANCE](progress.tensors)
         plan = measured_fit(plan, problem, settings, progress.tensors)
@@ -157,14 +159,6 @@ def fit_portrait(
     between, `plan` what is left out (default: that of `plan_fit`). Raises InputError when the fit diverges."""
     problems = stage_problems(portrait, load_avatar(prior_path), prior_path, work, settings, plan)
     run_stages([(problems[kind], stage) for kind, stage in settings.stages], progress, settings.block, seed, checkpoint)
-
-
-def set_variant(variant: str) -> None:
-    """Sets a Mitsuba variant with automatic differentiation. Raises InputError for any other."""
-    usable = [v for v in mi.variants() if "_ad_" in v and v.endswith("rgb")]
-    if variant not in usable:
-        raise InputError(f"no variant {variant}; this Mitsuba has {', '.join(usable)}")
-    mi.set_variant(variant)
 
 
 def prepare_folder(out: Path) -> Path:
@@ -300,7 +294,7 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     lobes = avatar.tensors["lobes"]
     write_lights(out / "lights.json", lobes)
     write_exr(out / "lights.exr", render_environment(lobes, 128))
-    write_png(out / "input.png", output.preview("final", portrait.image, portrait.mask))
+    write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
     output.write_scene(out / "scene.xml", portrait.camera)
 
     scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
@@ -320,9 +314,9 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))
 
     inside = portrait.mask * (layers["mask"] > 0.99)
-    report["psnr_inside_mask_db"] = round(output.psnr_inside(layers["final"], portrait.image, inside), 2)
+    report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
     eq_8 = layers["diffuse"] + layers["specular"]
-    report["psnr_of_unrefined_light_db"] = round(output.psnr_inside(eq_8, portrait.image, inside), 2)
+    report["psnr_of_unrefined_light_db"] = round(psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
     report["seconds"]["output"] = round(time.monotonic() - begun, 2)
     report["seconds"]["total"] = round(time.monotonic() - started, 2)

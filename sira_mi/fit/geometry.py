@@ -11,15 +11,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import Avatar, signed_distance_field
+from sira_mi.avatar.landmark_model import LandmarkModel, placed_landmarks, reference_landmarks
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_columns
 from sira_mi.fields.sdf import SdfField, deform, rigid_motion, surface
 from sira_mi.fit.rays import modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.skin import face_exposure
-from sira_mi.models import losses
-from sira_mi.models.avatar import Avatar, signed_distance_field
-from sira_mi.models.landmark_model import LandmarkModel, placed_landmarks, reference_landmarks
+from sira_mi.optimisation import losses
 from sira_mi.portrait.camera import Camera, landmark_weights
 from sira_mi.portrait.portrait import Portrait
 

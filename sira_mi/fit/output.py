@@ -12,29 +12,17 @@ import numpy as np
 from PIL import Image
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.export.scene import head, principal_point_offset, sensor
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
-from sira_mi.scene import head, principal_point_offset, sensor
+from sira_mi.relight.pictures import LAYERS, preview
 
-# The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
-_BRIGHTEST_SPECULAR = 0.08
 # Samples a pixel of the closed-form renders.
 _SAMPLES = 4
 # Side of a picture in the contact sheet, pixels.
 _TILE = 320
-# Channels of the `sira_sg` film: first channel and number of channels of every layer.
-LAYERS = {
-    "final": (0, 3),
-    "diffuse": (4, 3),
-    "specular": (7, 3),
-    "diffuse_albedo": (10, 3),
-    "specular_albedo": (13, 1),
-    "normal": (14, 3),
-    "depth": (17, 1),
-    "mask": (18, 1),
-}
 # The second light of the contact sheet: a warm key from the upper left, a cool rim from behind, fill and a dim sky.
 SECOND_LIGHT = np.array(
     [
@@ -82,24 +70,6 @@ def avatar_scene(
             "light": {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)},
         }
     )
-
-
-def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Display values in [0, 1] of a layer: sRGB for radiance and albedo, colours for normals, near-is-bright for
-    depth."""
-    if name == "normal":
-        return np.where(mask[..., None] > 0, 0.5 + 0.5 * image, 0)
-    if name == "mask":
-        return image
-    if name == "specular_albedo":
-        return linear_to_srgb(image / _BRIGHTEST_SPECULAR)
-    if name == "depth":
-        covered = mask > 0.99
-        if not covered.any():
-            return np.zeros_like(image)
-        near, far = image[covered].min(), image[covered].max()
-        return np.where(covered, 1 - 0.85 * (image - near) / max(far - near, 1e-6), 0)
-    return linear_to_srgb(image)
 
 
 def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
@@ -234,15 +204,6 @@ def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     x0, x1 = (int(np.clip(centre[0] + s * half, 0, width)) for s in (-1, 1))
     y0, y1 = (int(np.clip(centre[1] + s * half, 0, height)) for s in (-1, 1))
     return x0, y0, x1, y1
-
-
-def psnr_inside(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in dB of two linear images [H, W, 3], measured on sRGB values inside mask > 0.5."""
-    inside = mask > 0.5
-    if not inside.any():
-        return float("nan")
-    difference = linear_to_srgb(np.clip(image, 0, 1))[inside] - linear_to_srgb(np.clip(reference, 0, 1))[inside]
-    return float(-10 * np.log10(max(np.mean(difference**2), 1e-12)))
 
 
 def write_report(path: Path, report: dict) -> None:

@@ -17,15 +17,16 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from skimage.transform import resize_local_mean
 
+from sira_mi.avatar.file import Avatar, load_avatar
+from sira_mi.export.scene import head, sensor
 from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, refined_albedo, specular_albedo
 from sira_mi.fields.sdf import deform, evaluate_in_chunks
 from sira_mi.fit.appearance import AppearanceProblem
-from sira_mi.fit.output import LAYERS, head_box, psnr_inside
+from sira_mi.fit.output import head_box
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import decode_lobes, decoder
-from sira_mi.models.avatar import Avatar, load_avatar
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.scene import head, sensor
+from sira_mi.relight.pictures import LAYERS, psnr_inside
 
 # Where the scene keeps what the picture is made of.
 _SEEN = {

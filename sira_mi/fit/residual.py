@@ -24,7 +24,7 @@ from skimage.draw import polygon2mask
 from sira_mi.fields.sdf import in_three
 from sira_mi.fit.shaded import PhotoPoints
 from sira_mi.fit.skin import near_landmarks
-from sira_mi.models import losses
+from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import BROWS, EYES, LIPS, MOUTH
 from sira_mi.portrait.portrait import Portrait
 

@@ -8,15 +8,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import Avatar
+from sira_mi.export.scene import sensor
 from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
-from sira_mi.models.af_sm import diffuse_radiance, physical_radiance
-from sira_mi.models.avatar import Avatar
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.scene import sensor
+from sira_mi.sg.radiance import diffuse_radiance, physical_radiance
 from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, diffuse_arrival, even_directions, trace_open
 
 # Directions in which the points' visibility is traced.

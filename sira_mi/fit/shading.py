@@ -8,14 +8,14 @@ surface."""
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import Avatar
 from sira_mi.fields.appearance import diffuse_albedo
 from sira_mi.fields.sdf import SdfField, normalised, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.fit.geometry import GeometryProblem
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import decoder, photo_points, shade_points
-from sira_mi.models import losses
-from sira_mi.models.avatar import Avatar
+from sira_mi.optimisation import losses
 from sira_mi.portrait.portrait import Portrait, halved
 
 

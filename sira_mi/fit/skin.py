@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, softmax
 from skimage.draw import polygon2mask
 
+from sira_mi.avatar.file import Avatar
+from sira_mi.avatar.skin_tone import SKIN_LANDMARKS, skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.shaded import SeenPoints, base_albedo
-from sira_mi.models.af_sm import AppearanceTraining
-from sira_mi.models.avatar import Avatar
-from sira_mi.models.skin_tone import SKIN_LANDMARKS, skin_tone_loss, tone_of_luminance
 from sira_mi.portrait.landmarks import BELOW_EYES, EYES
 from sira_mi.portrait.portrait import Portrait
+from sira_mi.training.af_sm import AppearanceTraining
 
 # Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
 _REACH = 0.04
@@ -62,7 +62,7 @@ class SkinCues:
 class SkinLevel:
     """How the cues of a photo follow from y, the log luminance of its skin's albedo: y is normal about usual +
     by_radiance · log radiance, the contrast of an eye about y − white, and with odds of exp(misleading + darker · the
-    log of the brighter eye's white over its own) it is anything. The values are those of `python -m sira_mi.evaluate
+    log of the brighter eye's white over its own) it is anything. The values are those of `python -m studies.portraits
     skin` on portraits of training heads."""
 
     usual: float = -1.38

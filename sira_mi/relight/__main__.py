@@ -111,9 +111,9 @@ def output_stem(out: Path) -> Path:
 def _planned(subject, light, settings, yaws: list[float], options: argparse.Namespace) -> tuple:
     """The settings of the pictures at `yaws`, and the head for them, as `--keep-all` and the plan say; `--explain`
     prints the plan."""
-    from sira_mi.plan.decisions import explain
-    from sira_mi.plan.measure import measured
-    from sira_mi.plan.relight import plan_relight
+    from sira_mi.decisions import explain
+    from sira_mi.relight.leave_out import plan_relight
+    from sira_mi.relight.measure import measured
     from sira_mi.relight.render import load_head
 
     everything = replace(settings, exact=settings.integrator == "path")
@@ -136,10 +136,10 @@ def main(arguments: list[str] | None = None) -> int:
 
     from tqdm import tqdm
 
-    from sira_mi.fit.fit import set_variant
     from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare
     from sira_mi.relight.render import RelightSettings, render_passes, turned_scene, write_image
     from sira_mi.relight.subject import read_light, read_subject
+    from sira_mi.variants import set_variant
 
     set_variant(options.variant)
     settings = RelightSettings(

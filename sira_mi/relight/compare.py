@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sira_mi.fit.output import LAYERS, psnr_inside
+from sira_mi.relight.pictures import LAYERS, psnr_inside
 from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
 from sira_mi.relight.subject import Light, Subject
 

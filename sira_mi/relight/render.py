@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError
+from sira_mi.export.scene import head, orbited, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_exr, write_png
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.subject import Light, Subject
-from sira_mi.scene import head, orbited, sensor
 
 # Integrators by the name that the command knows them by.
 INTEGRATORS = {"sg": "sira_sg", "path": "path"}

@@ -9,8 +9,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.file import Avatar, load_avatar
 from sira_mi.errors import InputError
-from sira_mi.models.avatar import Avatar, load_avatar
 from sira_mi.portrait.camera import Camera
 from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
 from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights

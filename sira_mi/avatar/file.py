@@ -1,0 +1,230 @@
+"""The avatar: all networks, latents and lights of one head, as one safetensors file.
+
+A prior is the same thing with zero latents, its mean head, so that every plugin opens either. Networks are flat
+parameter vectors (`sira_mi.fields.mlp`). The file's metadata holds the format's name and the architecture as JSON;
+every size is checked against the architecture before any array is used.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from sira_mi.errors import InputError
+from sira_mi.fields.encoding import encoded_size
+from sira_mi.fields.mlp import Architecture, layers
+from sira_mi.fields.sdf import SdfField
+from sira_mi.files import write_through
+
+FORMAT = "sira-mi avatar 1"
+LANDMARKS = 468
+PRIOR = Path(__file__).with_name("prior.safetensors")
+_MAXIMUM_BYTES = 64 << 20
+_MAXIMUM_LOBES = 4096
+_MAXIMUM_DIRECTIONS = 256
+# Networks that an avatar may lack.
+OPTIONAL = {"light_refinement"}
+# Of a prior that knows how landmarks follow from places in reference space (`sira_mi.avatar.landmark_model`).
+LANDMARK_MODEL = {"landmark_placed", "landmark_directions", "landmark_offsets"}
+
+
+@dataclass(frozen=True)
+class AvatarArchitecture:
+    """Sizes of all decoders; octaves belong to the positional encoding of each network's point."""
+
+    features: int = 16  # N_γ, length of the auxiliary feature vector γ
+    sdf_octaves: int = 4
+    sdf_width: int = 96
+    sdf_depth: int = 4
+    sdf_latent: int = 128  # dimension of z_sdf
+    deforms: bool = True  # eqs 1-3; without, one field conditioned on z_sdf (H3D-Net, the ablation's baseline)
+    rendering_octaves: int = 5
+    rendering_width: int = 96
+    rendering_depth: int = 3
+    rendering_latent: int = 64  # dimension of z_r
+    albedo_octaves: int = 6
+    albedo_width: int = 64
+    albedo_depth: int = 3
+    albedo_latent: int = 32  # dimension of z_a
+    specular_octaves: int = 4
+    specular_width: int = 32
+    specular_depth: int = 2
+    specular_latent: int = 8  # dimension of z_s
+    refinement_octaves: int = 9
+    refinement_width: int = 96
+    refinement_depth: int = 3
+    lobes: int = 48  # N_l, number of spherical Gaussians of the illumination decoder
+    illumination_width: int = 64
+    illumination_depth: int = 2
+    illumination_latent: int = 24  # dimension of z_l
+
+    def __post_init__(self):
+        sizes = {k: v for k, v in dataclasses.asdict(self).items() if k != "deforms"}
+        if any(not isinstance(v, int) or not 0 < v <= 4096 for v in sizes.values()):
+            raise ValueError("every size of an avatar is a whole number from 1 to 4096")
+        if not isinstance(self.deforms, bool):
+            raise ValueError("deforms is true or false")
+
+    @cached_property
+    def networks(self) -> dict[str, Architecture]:
+        """The architecture of every network, by the name of its tensor."""
+        gamma = self.features
+        sdf = encoded_size(self.sdf_octaves)
+        albedo = encoded_size(self.albedo_octaves) + gamma
+        width, depth = self.sdf_width, self.sdf_depth
+        return {
+            "deformation": Architecture(sdf, 3 * self.deforms + gamma, width, depth, self.sdf_latent),
+            "reference": Architecture(sdf, 1, width, depth, 0 if self.deforms else self.sdf_latent),
+            "rendering": Architecture(
+                encoded_size(self.rendering_octaves) + 6 + gamma,
+                3,
+                self.rendering_width,
+                self.rendering_depth,
+                self.rendering_latent,
+            ),
+            "diffuse_albedo": Architecture(albedo, 3, self.albedo_width, self.albedo_depth, self.albedo_latent),
+            "specular_albedo": Architecture(
+                encoded_size(self.specular_octaves),
+                1,
+                self.specular_width,
+                self.specular_depth,
+                self.specular_latent,
+            ),
+            "albedo_refinement": Architecture(
+                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
+            ),
+            "light_refinement": Architecture(
+                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
+            ),
+            "illumination": Architecture(
+                self.illumination_latent, 7 * self.lobes, self.illumination_width, self.illumination_depth
+            ),
+        }
+
+    @cached_property
+    def latents(self) -> dict[str, int]:
+        """Dimension of every latent, by the name of its tensor."""
+        return {
+            "z_sdf": self.sdf_latent,
+            "z_r": self.rendering_latent,
+            "z_a": self.albedo_latent,
+            "z_s": self.specular_latent,
+            "z_l": self.illumination_latent,
+        }
+
+
+def signed_distance_field(architecture: AvatarArchitecture, deformation, reference, z_sdf, motion=None) -> SdfField:
+    """The field of flat parameters of both networks and of shape latents, a tensor [dim, S]; `motion` as in
+    `SdfField`."""
+    networks, deforms = architecture.networks, architecture.deforms
+    return SdfField(
+        layers(networks["deformation"], deformation, z_sdf),
+        layers(networks["reference"], reference, None if deforms else z_sdf),
+        architecture.sdf_octaves,
+        deforms,
+        motion,
+    )
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
+    architecture (`light_refinement` may be missing); `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light;
+    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown). A prior may hold the
+    tensors of `sira_mi.avatar.landmark_model` too."""
+
+    architecture: AvatarArchitecture
+    tensors: dict[str, np.ndarray]
+    roughness: float = 0.5  # of the specular BRDF, fixed
+    k_s: float = 1.0  # weight of the specular BRDF, eq. 8
+    k_r: float = 1.0  # weight of the albedo refinement, eq. 11
+
+    def replaced(self, **tensors: np.ndarray) -> "Avatar":
+        """The same avatar with some tensors replaced."""
+        return dataclasses.replace(self, tensors={**self.tensors, **tensors})
+
+
+def save_avatar(path: str | Path, avatar: Avatar) -> None:
+    """Writes a safetensors file under a temporary name, then renames it.
+
+    Raises InputError when the file cannot be written."""
+    description = {
+        "architecture": dataclasses.asdict(avatar.architecture),
+        "roughness": avatar.roughness,
+        "k_s": avatar.k_s,
+        "k_r": avatar.k_r,
+    }
+    tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
+    data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
+    data = _with_sorted_header(data)
+    write_through(path, lambda file: file.write_bytes(data))
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """The same safetensors file, its header in a fixed order: the library writes metadata in an order that varies."""
+    size = 8 + int.from_bytes(data[:8], "little")
+    header = json.dumps(json.loads(data[8:size]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + data[size:]
+
+
+def load_avatar(path: str | Path | None = None) -> Avatar:
+    """Reads an avatar or prior file; without a path, the prior shipped with the package.
+
+    Raises InputError for a file that is missing, damaged, of another kind, or holds values that are not finite."""
+    path = Path(path) if path else PRIOR
+    try:
+        if path.stat().st_size > _MAXIMUM_BYTES:
+            raise InputError(f"{path} is larger than any avatar; give an avatar.safetensors written by sira_mi")
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise InputError(f"{path} is not an avatar of this version ({FORMAT}); fit the photo again")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (not a mapping)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot read the avatar {path}: {reason}") from error
+    except (SafetensorError, TypeError) as error:
+        raise InputError(f"{path} is damaged or not a safetensors file: {error}") from error
+    try:
+        description = json.loads(metadata["avatar"])
+        architecture = AvatarArchitecture(**description["architecture"])
+        scalars = {name: float(description[name]) for name in ("roughness", "k_s", "k_r")}
+        avatar = Avatar(architecture, tensors, **scalars)
+        _check(avatar)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged: {error}") from error
+    return avatar
+
+
+def _check(avatar: Avatar) -> None:
+    """Raises ValueError unless every tensor is there, of its due size and type, and finite."""
+    architecture, tensors = avatar.architecture, avatar.tensors
+    due = {name: (network.parameters,) for name, network in architecture.networks.items()}
+    due |= {name: (size,) for name, size in architecture.latents.items()}
+    due |= {"lobes": (*tensors["lobes"].shape[:1], 7), "landmarks": (LANDMARKS, 3)}
+    if not 0 < tensors["lobes"].size <= 7 * _MAXIMUM_LOBES:
+        raise ValueError(f"between 1 and {_MAXIMUM_LOBES} lobes expected")
+    for name in OPTIONAL - set(tensors):
+        del due[name]
+    if LANDMARK_MODEL & set(tensors):
+        count = len(tensors["landmark_directions"])
+        if not 0 < count <= _MAXIMUM_DIRECTIONS:
+            raise ValueError(f"between 1 and {_MAXIMUM_DIRECTIONS} directions of landmarks expected")
+        due |= {"landmark_placed": (LANDMARKS, 3)}
+        due |= dict.fromkeys(("landmark_directions", "landmark_offsets"), (count, LANDMARKS, 3))
+    for name, shape in due.items():
+        tensor = tensors[name]
+        if tensor.shape != shape or tensor.dtype != np.float32:
+            raise ValueError(f"tensor {name} is {tensor.dtype}{list(tensor.shape)}, float32{list(shape)} expected")
+        if name != "landmarks" and not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name} has values that are not finite")
+    if extra := set(tensors) - set(due):
+        raise ValueError(f"unknown tensors {sorted(extra)}")
+    if not (0.01 <= avatar.roughness <= 1 and 0 <= avatar.k_s <= 1 and 0 <= avatar.k_r <= 1):
+        raise ValueError("roughness lies in [0.01, 1], k_s and k_r in [0, 1]")

@@ -1,0 +1,74 @@
+"""Landmarks of the SA-SM's heads.
+
+Points with the same place in reference space lie on the same part of a face, about: the deformation is learned with
+landmarks as one loss among many. What the places that it gives miss of a head's true landmarks is linear in those
+places themselves, by the principal directions that they vary in over the training's heads.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.avatar.file import Avatar, signed_distance_field
+from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks
+
+# Fixed-point steps that find a landmark's place from its place in reference space.
+_STEPS = 4
+
+
+def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
+    """Which landmarks [468] bool the mean head has, and the places [3, L] of those in reference space."""
+    mean = prior.tensors["landmarks"]
+    known = np.isfinite(mean).all(axis=1)
+    decoders = mi.Float(prior.tensors["deformation"]), mi.Float(prior.tensors["reference"])
+    zero = mi.TensorXf(np.zeros((len(prior.tensors["z_sdf"]), 1), np.float32))
+    field = signed_distance_field(prior.architecture, *decoders, zero)
+    return known, evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
+
+
+def placed_landmarks(field: SdfField, x_ref, start):
+    """Where the field maps to landmarks' places x_ref [3, L] in reference space: tensor [3, L], found by fixed-point
+    steps from `start` [3, L]. Without gradients."""
+    with dr.suspend_grad():
+        x, x_ref = mi.TensorXf(start), mi.TensorXf(x_ref)
+        for _ in range(_STEPS):
+            x = x - 0.8 * (deform(field, x)[0] - x_ref)
+            dr.eval(x)
+        return x
+
+
+class LandmarkModel:
+    """True landmarks from placed ones: mean + (placed − mean placed) · directionsᵀ · offsets, of the tensors
+    `landmarks` [468, 3], `landmark_placed` [468, 3], `landmark_directions` [K, 468, 3] and `landmark_offsets`
+    [K, 468, 3] of a prior. A prior that lacks the last three takes places as they are."""
+
+    def __init__(self, prior: Avatar):
+        tensors = prior.tensors
+        self.known = np.isfinite(tensors["landmarks"]).all(axis=1)
+        self.linear = "landmark_directions" in tensors
+        if self.linear:
+            self.mean, self.placed = self._rows(tensors["landmarks"]), self._rows(tensors["landmark_placed"])
+            self.across = mi.TensorXf(np.ascontiguousarray(self._rows(tensors["landmark_directions"]).numpy().T))
+            self.offsets = self._rows(tensors["landmark_offsets"])
+
+    def _rows(self, values: np.ndarray):
+        """Tensor [..., 3 L] of [..., 468, 3], all x first."""
+        values = np.moveaxis(values[..., self.known, :], -1, -2)
+        return mi.TensorXf(np.ascontiguousarray(values.reshape(-1, 3 * int(self.known.sum()))))
+
+    def __call__(self, placed):
+        """Tensor [3, L] of tensor [3, L]."""
+        if not self.linear:
+            return placed
+        row = dr.reshape(placed, (1, 3 * placed.shape[1]))
+        w = (row - self.placed) @ self.across
+        return dr.reshape(self.mean + w @ self.offsets, placed.shape)
+
+
+def landmarks_of(prior: Avatar, field: SdfField) -> np.ndarray:
+    """The landmarks [468, 3] of a head of the prior by its field, without motion; NaN where unknown."""
+    known, x_ref = reference_landmarks(prior)
+    start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
+    landmarks = np.full((len(known), 3), np.nan, np.float32)
+    landmarks[known] = LandmarkModel(prior)(placed_landmarks(field, x_ref, start)).numpy().T
+    return landmarks

@@ -1,1 +1,0 @@
-"""Where heads come from: one module a source, each delivering `sira_mi.collection.subject.Subject`."""

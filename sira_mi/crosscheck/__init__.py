@@ -1,1 +1,0 @@
-"""Cross-validation of closed-form shading with path tracing (`python -m sira_mi.crosscheck`)."""

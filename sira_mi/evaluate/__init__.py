@@ -1,1 +1,0 @@
-"""How good the priors (`priors`) and the fits (`portraits`) are."""

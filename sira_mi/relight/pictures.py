@@ -1,0 +1,48 @@
+"""Pictures of a head: the layers of the `sira_sg` film, previews of them, and how near two pictures are."""
+
+import numpy as np
+
+from sira_mi.portrait.load import linear_to_srgb
+
+# The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
+_BRIGHTEST_SPECULAR = 0.08
+
+
+# Channels of the `sira_sg` film: first channel and number of channels of every layer.
+LAYERS = {
+    "final": (0, 3),
+    "diffuse": (4, 3),
+    "specular": (7, 3),
+    "diffuse_albedo": (10, 3),
+    "specular_albedo": (13, 1),
+    "normal": (14, 3),
+    "depth": (17, 1),
+    "mask": (18, 1),
+}
+
+
+def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Display values in [0, 1] of a layer: sRGB for radiance and albedo, colours for normals, near-is-bright for
+    depth."""
+    if name == "normal":
+        return np.where(mask[..., None] > 0, 0.5 + 0.5 * image, 0)
+    if name == "mask":
+        return image
+    if name == "specular_albedo":
+        return linear_to_srgb(image / _BRIGHTEST_SPECULAR)
+    if name == "depth":
+        covered = mask > 0.99
+        if not covered.any():
+            return np.zeros_like(image)
+        near, far = image[covered].min(), image[covered].max()
+        return np.where(covered, 1 - 0.85 * (image - near) / max(far - near, 1e-6), 0)
+    return linear_to_srgb(image)
+
+
+def psnr_inside(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in dB of two linear images [H, W, 3], measured on sRGB values inside mask > 0.5."""
+    inside = mask > 0.5
+    if not inside.any():
+        return float("nan")
+    difference = linear_to_srgb(np.clip(image, 0, 1))[inside] - linear_to_srgb(np.clip(reference, 0, 1))[inside]
+    return float(-10 * np.log10(max(np.mean(difference**2), 1e-12)))

@@ -1,2 +1,0 @@
-"""How exact the project's formulas, samplers and ray tracing are in single precision, at the ends of their ranges too:
-`python -m sira_mi.stability` measures and writes `docs/stability.md`."""

@@ -1,0 +1,141 @@
+"""What a textured head is made of: skin, hair, eyes and cloth told apart by place and colour, and the parts of a scene
+that follow."""
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+from skimage.color import rgb2lab
+from skimage.measure import points_in_poly
+
+from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
+from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.training.collection import skin
+from sira_mi.training.collection.annotation import mean_head
+from sira_mi.training.collection.render import Part
+from sira_mi.training.collection.textured_surface import Surface, place_index, smooth_normals
+
+FACE_EDGE, HEAD_EDGE, BODY_EDGE = 0.03, 0.045, 0.07  # scene units, longest edge on the face, the head and below
+# Landmark indices.
+CHIN, NOSE_TIP = 152, 1
+CHEEKS = [50, 280, 205, 425, 101, 330, 151, 36, 266]
+LIPS = [61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185, 13, 14, 82, 312]
+OVAL = [10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152, 148, 176, 149]
+OVAL += [150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109]
+LIGHTNESS_WEIGHT = 0.6  # of L* beside a* and b* where colours are told apart
+BALD = 12.0  # colour distance between crown and cheeks below which no hair is painted on the scalp
+SPECULAR = {skin.HAIR: 0.3, skin.CLOTH: 0.1, skin.EYE: 0.9}
+
+
+def head_edges(middle: np.ndarray) -> np.ndarray:
+    """Longest edge [E] at midpoints [E, 3] in the project's frame; there is no need to refine what no camera sees."""
+    longest = np.where(middle[:, 1] > -1.3, np.where(middle[:, 2] > 0.3, FACE_EDGE, HEAD_EDGE), BODY_EDGE)
+    outside = ((middle < np.array(DOMAIN_LOWER) - 0.3) | (middle > np.array(DOMAIN_UPPER) + 0.3)).any(1)
+    return np.where(outside, np.inf, longest)
+
+
+def face_mask(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """Whether points [N, 3] belong to the face: in front, inside the oval of the landmarks [468, 3] seen from there."""
+    oval = landmarks[OVAL]
+    return (points[:, 2] > oval[:, 2].min() - 0.1) & points_in_poly(points[:, :2], oval[:, :2])
+
+
+def complete(landmarks: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Landmarks [468, 3] with the mean head's where there is none."""
+    return np.where(valid[:, None], landmarks, mean_head()[0])
+
+
+def perceptual(albedo: np.ndarray) -> np.ndarray:
+    """CIE L*a*b* [N, 3] of linear colours, lightness reduced, so that shading baked into a texture counts less."""
+    return rgb2lab(linear_to_srgb(albedo)) * [LIGHTNESS_WEIGHT, 1, 1]
+
+
+def classify(vertices: np.ndarray, triangles: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """Region code [N] of a textured head and body in the project's frame, from places and colours: hair is around the
+    face and nearer in colour to the crown than to the cheeks; cloth is below the chin and unlike the cheeks."""
+    colour = perceptual(albedo)
+    face = face_mask(vertices, landmarks)
+    chin = landmarks[CHIN, 1]
+    cheeks = np.median(colour[near_landmarks(vertices, landmarks, CHEEKS, 0.12)], axis=0)
+    above = vertices[:, 1] - np.where(np.abs(vertices[:, 0]) < 1.2, vertices[:, 1], -np.inf).max()
+    crown = np.median(colour[(above > -0.3) & (np.abs(vertices[:, 0]) < 1.2)], axis=0)
+    hairy = np.zeros(len(vertices), bool)
+    way = crown - cheeks
+    if np.linalg.norm(way) > BALD:
+        hairy = ((colour - cheeks) @ way > 0.45 * (way @ way)) & ~face
+        hairy &= (vertices[:, 1] > chin + 0.2) | ((vertices[:, 1] > chin - 0.5) & (vertices[:, 2] < -0.2))
+    shoulders = (vertices[:, 1] < chin - 0.7) & (np.abs(vertices[:, 0]) > 0.9) & (vertices[:, 1] > DOMAIN_LOWER[1])
+    clothed = np.zeros(len(vertices), bool)
+    if shoulders.any():
+        fabric = np.median(colour[shoulders], axis=0)
+        unlike = np.clip(0.45 * np.linalg.norm(fabric - cheeks), 7, 16)
+        clothed = (np.linalg.norm(colour - cheeks, axis=1) > unlike) & ~face & (vertices[:, 1] < chin)
+        nearer_crown = np.linalg.norm(colour - crown, axis=1) < np.linalg.norm(colour - fabric, axis=1)
+        clothed &= ~(hairy & nearer_crown)
+        hairy &= ~clothed
+    shares = np.stack([~hairy & ~clothed, hairy, clothed], axis=1).astype(float)
+    index = place_index(vertices)
+    ends = index[np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)]
+    graph = sparse.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (index.max() + 1,) * 2)
+    graph = graph + graph.T + sparse.identity(len(graph.indptr) - 1)
+    graph = sparse.diags(1 / np.asarray(graph.sum(1)).ravel()) @ graph
+    places = np.zeros((index.max() + 1, 3))
+    places[index] = shares
+    for _ in range(6):
+        places = graph @ places
+    return np.array([skin.SKIN, skin.HAIR, skin.CLOTH])[places[index].argmax(1)]
+
+
+def near_landmarks(vertices: np.ndarray, landmarks: np.ndarray, chosen: list[int], radius: float) -> np.ndarray:
+    """Indices of the vertices within a radius of the chosen landmarks, at least the nearest one of each."""
+    tree = cKDTree(landmarks[chosen])
+    inside = np.flatnonzero(tree.query(vertices, distance_upper_bound=radius)[0] < radius)
+    return np.union1d(inside, cKDTree(vertices).query(landmarks[chosen])[1])
+
+
+def albedo_scale(vertices: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> float:
+    """The factor that brings the cheeks' luminance into the range of measured skin; 1 inside it."""
+    weights = np.array(LUMINANCE)
+    lightness = float(np.median(albedo[near_landmarks(vertices, landmarks, CHEEKS, 0.12)] @ weights))
+    low, high = float(skin.DARK_SKIN @ weights), float(skin.LIGHT_SKIN @ weights)
+    return float(np.clip(lightness, low, high) / max(lightness, 1e-3))
+
+
+def specular_strength(vertices: np.ndarray, region: np.ndarray, landmarks: np.ndarray, base: float) -> np.ndarray:
+    """Specular strength [N]: skin has `base`, more on lips, nose and forehead; hair, cloth and eyes have their own."""
+    distance = cKDTree(landmarks[LIPS]).query(vertices)[0]
+    lips = np.exp(-((distance / 0.06) ** 2))
+    nose = np.exp(-(((vertices - landmarks[NOSE_TIP] - [0, 0.15, 0]) / [0.16, 0.28, 0.35]) ** 2).sum(1))
+    strength = base + 0.16 * lips + 0.14 * nose
+    for code, value in SPECULAR.items():
+        strength[region == code] = value
+    return np.clip(strength, 0.02, 1)
+
+
+def painted_part(surface: Surface, region: np.ndarray, landmarks: np.ndarray, scale: float, base: float) -> Part:
+    """A part of a surface in the project's frame with the region codes [N] of its vertices."""
+    codes = np.sort(region[surface.triangles], axis=1)[:, 1]
+    return Part(
+        surface.vertices,
+        surface.triangles,
+        smooth_normals(surface.vertices, surface.triangles),
+        np.clip(surface.colours() * scale, 0.004, 0.9),
+        specular_strength(surface.vertices, region, landmarks, base),
+        codes,
+    )
+
+
+def plain_part(surface: Surface, code: int = skin.SKIN) -> Part:
+    """A part of one region, with its specular strength or that of skin."""
+    return Part(
+        surface.vertices,
+        surface.triangles,
+        smooth_normals(surface.vertices, surface.triangles),
+        np.clip(surface.colours(), 0.004, 0.9),
+        np.full(len(surface.vertices), SPECULAR.get(code, 0.4)),
+        np.full(len(surface.triangles), code),
+    )
+
+
+def skin_specular(seed: int) -> float:
+    """A person's base specular strength of skin (FLARE: 0.375 ± 0.166, of one person's parts less)."""
+    return float(np.clip(np.random.default_rng([seed, 21]).normal(0.375, 0.09), 0.15, 0.65))

@@ -1,0 +1,41 @@
+"""What every source of heads delivers: one person as closed surfaces with materials, landmarks and provenance."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sira_mi.training.collection.render import Part
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A head in the project's frame: scene units of 100 mm, origin between the ears, +y up, +z front."""
+
+    name: str  # unique within the collection, SOURCE/…
+    parts: list[Part]
+    landmarks: np.ndarray  # [468, 3] scene units
+    landmarks_valid: np.ndarray  # [468] bool
+    group: dict[str, str]  # "ancestry", "sex" and "age"; "unknown" where the source does not say
+    description: dict  # JSON types: everything drawn
+    licence: str
+
+
+class BrokenHead(ValueError):
+    """A head that cannot be used; its message is the reason, which the manifest lists."""
+
+
+class Source(Protocol):
+    """Identities of one kind. Holds paths and numbers only, so that worker processes can take it over."""
+
+    name: str
+    licence: str
+
+    def count(self) -> int:
+        """Number of identities."""
+
+    def title(self, number: int) -> str:
+        """Name of identity `number`, SOURCE/…, that its subject has."""
+
+    def subject(self, number: int, seed: int) -> Subject:
+        """Identity `number`, its look drawn from `seed`. Raises `BrokenHead` when it cannot be used."""

@@ -1,0 +1,82 @@
+"""The prior: a trained SA-SM and AF-SM as one avatar with mean latents, its mean head."""
+
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.avatar.file import Avatar, AvatarArchitecture
+from sira_mi.fields.appearance import illumination
+from sira_mi.fields.mlp import initial_parameters, layers
+
+NETWORKS_OF_SHAPE = ("deformation", "reference", "rendering")
+NETWORKS_OF_APPEARANCE = ("diffuse_albedo", "specular_albedo", "illumination")
+
+
+def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [dim] of latents [dim, scenes] and a matrix [dim, dim] that takes a standard normal vector to their
+    covariance: its columns are the principal directions, the widest first, as long as their standard deviations."""
+    mean = latents.mean(axis=1)
+    directions, deviations, _ = np.linalg.svd(latents - mean[:, None], full_matrices=True)
+    padded = np.zeros(len(latents))
+    padded[: len(deviations)] = deviations / np.sqrt(max(latents.shape[1] - 1, 1))
+    return mean, directions * padded
+
+
+def whitened(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Network parameters that take a standard normal latent z for what `mean + spread z` was. A latent that shifts
+    hidden layers: in each of them Z mean is added to the bias, and Z spread takes the place of Z. A latent that is the
+    network's input (the illumination decoder's): the same in the first layer, with its weights."""
+    flat, offset = network.copy(), 0
+    for k, (weight, bias, latent) in enumerate(architecture.networks[name].shapes()):
+        start_bias = offset + weight[0] * weight[1]
+        start_latent = start_bias + bias[0]
+        end = start_latent + latent[0] * latent[1]
+        if latent[1]:
+            mixed, shape = slice(start_latent, end), latent
+        elif k == 0 and name == "illumination":
+            mixed, shape = slice(offset, start_bias), weight
+        else:
+            mixed = None
+        if mixed is not None:
+            matrix = flat[mixed].reshape(shape)
+            flat[start_bias:start_latent] += matrix @ mean
+            flat[mixed] = (matrix @ spread).ravel()
+        offset = end
+    return flat
+
+
+def assemble_prior(
+    architecture: AvatarArchitecture,
+    shape: dict[str, np.ndarray],
+    appearance: dict[str, np.ndarray],
+    landmarks: np.ndarray,
+    roughness: float,
+    seed: int,
+) -> Avatar:
+    """The mean head of both trained models. All latents become standard normal: the zero latent is the mean of the
+    trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement
+    starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes that have them."""
+    owners = {
+        "z_sdf": "deformation",
+        "z_r": "rendering",
+        "z_a": "diffuse_albedo",
+        "z_s": "specular_albedo",
+        "z_l": "illumination",
+    }
+    tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {
+        name: appearance[name] for name in NETWORKS_OF_APPEARANCE
+    }
+    latents = {**shape, **appearance}
+    for name, network in owners.items():
+        tensors[network] = whitened(architecture, network, tensors[network], *whitening(latents[name]))
+    for name, size in architecture.latents.items():
+        tensors[name] = np.zeros(size, np.float32)
+    rng = np.random.default_rng([seed, 4])
+    refinement = architecture.networks["albedo_refinement"]
+    tensors["albedo_refinement"] = initial_parameters(refinement, rng, output_scale=0.0)
+    network = layers(architecture.networks["illumination"], mi.Float(tensors["illumination"]))
+    tensors["lobes"] = illumination(network, mi.TensorXf(tensors["z_l"][:, None])).numpy()[:, :, 0]
+    with np.errstate(invalid="ignore"):
+        counts = np.isfinite(landmarks[:, :, :1]).sum(axis=0)
+        mean = np.nansum(landmarks, axis=0) / np.maximum(counts, 1)
+    tensors["landmarks"] = np.where(counts > 0, mean, np.nan).astype(np.float32)
+    return Avatar(architecture, {k: v.astype(np.float32) for k, v in tensors.items()}, roughness=roughness, k_r=0.0)

@@ -1,0 +1,88 @@
+"""Training scenes: the arrays of a collection that the statistical models may see.
+
+Albedo truth is in the scene files too, but is not loaded here: training never sees it. Nor does it see the views
+`HELD_OUT_VIEWS`, on which renderings are compared.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from sira_mi.conventions import HELD_OUT_VIEWS
+from sira_mi.errors import InputError
+
+_ARRAYS = (
+    "points",
+    "normals",
+    "region",
+    "volume",
+    "volume_distance",
+    "landmarks",
+    "landmarks_valid",
+    "visible",
+    "colors",
+    "world_to_camera",
+)
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """One head scan with its views; coordinates in scene units, colours linear."""
+
+    points: np.ndarray  # [P, 3] on the visible surface
+    normals: np.ndarray  # [P, 3] unit
+    region: np.ndarray  # [P] uint8: 0 skin, 1 hair, 2 eye, 3 cloth
+    volume: np.ndarray  # [Q, 3] points of known signed distance
+    volume_distance: np.ndarray  # [Q], positive outside
+    landmarks: np.ndarray  # [468, 3], NaN where unknown
+    sample_point: np.ndarray  # [C] index of the point that observation c belongs to
+    sample_view: np.ndarray  # [C] index of the view that saw it
+    sample_color: np.ndarray  # [C, 3] linear radiance
+    camera_centres: np.ndarray  # [V, 3]
+
+    def views(self, samples: np.ndarray) -> np.ndarray:
+        """Unit directions [n, 3] from the camera to the point, for observations `samples` [n]."""
+        v = self.points[self.sample_point[samples]] - self.camera_centres[self.sample_view[samples]]
+        return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def load_scene(path: Path) -> TrainingScene:
+    """Reads one scene of a collection. Raises InputError for a file that is not one."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in _ARRAYS}
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"{path} is not a scene of a collection: {error}") from error
+    rotation, translation = data["world_to_camera"][:, :3, :3], data["world_to_camera"][:, :3, 3]
+    usable = data["visible"] & np.isfinite(data["colors"]).all(axis=2)
+    usable[:, np.isin(np.arange(usable.shape[1]), HELD_OUT_VIEWS)] = False
+    point, view = np.nonzero(usable)
+    return TrainingScene(
+        points=data["points"].astype(np.float32),
+        normals=data["normals"].astype(np.float32),
+        region=data["region"].astype(np.uint8),
+        volume=data["volume"].astype(np.float32),
+        volume_distance=data["volume_distance"].astype(np.float32),
+        landmarks=np.where(data["landmarks_valid"][:, None], data["landmarks"], np.nan).astype(np.float32),
+        sample_point=point.astype(np.int32),
+        sample_view=view.astype(np.uint8),
+        sample_color=data["colors"][point, view].astype(np.float32),
+        camera_centres=(-np.einsum("vji,vj->vi", rotation, translation)).astype(np.float32),
+    )
+
+
+def load_training_scenes(folder: Path) -> list[TrainingScene]:
+    """All scenes of the manifest's training split. Raises InputError when there are fewer than two."""
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train" and "error" not in scene]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder} is not a collection: {error}; build one with python -m sira_mi.training.collection"
+        ) from error
+    if len(names) < 2:
+        raise InputError(f"{folder} has {len(names)} training scenes; at least two are needed")
+    return [load_scene(folder / Path(name).name) for name in names]

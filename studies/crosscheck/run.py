@@ -1,0 +1,166 @@
+"""All measurements of the cross-validation, one after the other, within a budget of time."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from studies.crosscheck import causes, curves, speed
+from studies.crosscheck.case import Case
+from studies.crosscheck.evidence import Lit, kept, key_of
+from studies.crosscheck.images import LaunchLog, converge, path, render
+from studies.crosscheck.lights import OWN, SOFT, lobes_of
+from studies.crosscheck.regions import HEAD, SILHOUETTE
+
+# What each light may take of its share of the budget; loading, points and speed take the rest.
+_REFERENCE, _INTERREFLECTION, _CURVES = 0.45, 0.07, 0.28
+# Random seeds of what must be independent.
+_SEED_REFERENCE, _SEED_INTERREFLECTION, _SEED_CURVES = 101, 202, 303
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How much is measured."""
+
+    size: int = 192  # pixels, longer side of the picture
+    minutes: float = 20.0  # of wall time, about, for everything
+    bound: float = 0.005  # on the reference's relative standard error
+    voxel: float = 0.02  # of the reference's mesh, scene units
+    usual_voxel: float = 0.05  # of the plugin's usual mesh, scene units
+    pass_samples: int = 32  # a pixel and pass of the reference
+    side: int = 2  # the points of a half: side² rays a pixel
+    directions: int = 48  # of each kind for direct light at a point
+    seed: int = 0
+    speed: bool = True  # measure the ratios and costs too
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Everything that the page tells."""
+
+    case: Case
+    settings: Settings
+    lit: list[Lit]
+    ratios: list[speed.Ratio]
+    costs: list[speed.Cost]
+    seconds: float  # wall time, of earlier runs too where their evidence was used
+
+
+def settings_of_light(case: Case, chosen: tuple[str, ...], names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Lobes [N_l, 7] by name: the `chosen` settings of `names`, or all of them and the scene's own."""
+    lights = {name: lobes_of(name) for name in chosen or names}
+    if case.lobes is not None and not chosen:
+        lights = {OWN: case.lobes, **lights}
+    return lights
+
+
+def measure(
+    case: Case,
+    lights: dict[str, np.ndarray],
+    settings: Settings,
+    say: Callable[[str], object] = print,
+    evidence: Path | None = None,
+) -> Measured:
+    """Measures everything; `say` is told what has been done. What the folder `evidence` holds of the same case and
+    settings is not measured again."""
+    start, done = time.monotonic(), set()
+    head = functools.cache(case.head)
+
+    @functools.cache
+    def gathered():
+        heads = head(settings.voxel), head(settings.usual_voxel)
+        halves = causes.gather(case, *heads, settings.side, settings.seed)
+        say(f"heads and points after {time.monotonic() - start:.0f} s")
+        return *heads, halves
+
+    budget = 60 * settings.minutes * (0.85 if settings.speed else 1.0) / len(lights)
+    lit = []
+    for name, lobes in lights.items():
+        key = key_of(case, settings, lobes)
+
+        def compute(name=name, lobes=lobes):
+            done.add(name)
+            return _under_light(case, *gathered(), name, lobes, settings, budget)
+
+        lit.append(kept(evidence, name, key, compute))
+        one = lit[-1].reference
+        say(
+            f"{name}: reference of {one.passes * settings.pass_samples} samples, standard error {100 * one.error:.2f}% "
+            f"after {one.seconds:.0f} s; all after {time.monotonic() - start:.0f} s"
+        )
+    ratios, costs = [], []
+    if settings.speed:
+        lobes = lights.get(SOFT, next(iter(lights.values())))
+        usual = head(settings.usual_voxel)
+        ratios = [*speed.texture_ratios(case, usual, lobes, 16), speed.hit_ratio(case, usual, 2)]
+        ratios.append(speed.compilation_ratio(case, usual, lobes))
+        costs = [*speed.shading_costs(), *speed.width_costs(case, lobes)]
+        say(f"speed after {time.monotonic() - start:.0f} s")
+    earlier = sum(one.seconds for one in lit if one.light not in done)
+    return Measured(case, settings, lit, ratios, costs, time.monotonic() - start + earlier)
+
+
+def _under_light(
+    case: Case,
+    head: mi.Shape,
+    usual: mi.Shape,
+    halves: list[causes.Half],
+    name: str,
+    lobes: np.ndarray,
+    settings: Settings,
+    budget: float,
+) -> Lit:
+    start = time.monotonic()
+    pictures = causes.shade_halves(case, head, usual, halves, lobes, settings.directions, settings.seed)
+    regions = causes.masks(halves, pictures)
+    scene, full, direct = case.scene(head, lobes), path(), path(2)
+    samples, seed, log = settings.pass_samples, settings.seed, LaunchLog()
+
+    def traced(k):
+        return render(scene, full, samples, seed, _SEED_REFERENCE, k, log=log)
+
+    def indirect(k):
+        both = (render(scene, one, samples, seed, _SEED_INTERREFLECTION, k, log=log) for one in (full, direct))
+        first, second = both
+        return first - second
+
+    mask = regions[HEAD]
+    traced(0)  # compiles the kernels, outside of the time
+    reference = converge(traced, mask, settings.bound, _REFERENCE * budget)
+    level = max(float(reference.mean[mask].mean()), 1e-12)
+    interreflection = converge(indirect, mask, settings.bound / 2, _INTERREFLECTION * budget, level)
+    named = causes.parts(pictures, reference, interreflection.halves)
+    rows = [row for form, parts in named.items() for row in causes.rows(name, form, parts, regions, level)]
+    rows.append(causes.noise_row(name, reference, regions, level))
+    rows.append(causes.usual_row(name, pictures, regions, level, settings.usual_voxel))
+    plain, visible = named[causes.FORM], named[causes.VISIBLE]
+    sheet = {
+        "reference": reference.mean,
+        "with visibility": pictures.visible.mean(axis=0),
+        **{cause: part.mean(axis=0) for cause, part in plain.items() if cause not in (causes.FLOAT32, causes.TOTAL)},
+        "total without visibility": plain[causes.TOTAL].mean(axis=0),
+        "total with visibility": visible[causes.TOTAL].mean(axis=0),
+    }
+    points, limits = curves.measure_curves(
+        case, head, name, lobes, reference, mask, _CURVES * budget, settings.seed + _SEED_CURVES, log
+    )
+    agreement = _agreement(scene, pictures, settings, mask & ~regions[SILHOUETTE], level)
+    seconds = time.monotonic() - start
+    return Lit(
+        name, reference, level, regions, rows, sheet, points, limits, agreement, seconds, *dataclasses.astuple(log)
+    )
+
+
+def _agreement(scene: mi.Scene, pictures: causes.Pictures, settings: Settings, mask: np.ndarray, level: float) -> float:
+    """How far `sira_sg` is from the closed form with visibility at the points of this package, without noise."""
+    plugin = mi.load_dict({"type": "sira_sg", "hide_emitters": True})
+    images = [render(scene, plugin, 4 * settings.side**2, settings.seed, 4, k) for k in range(2)]
+    differences = [image - form for image, form in zip(images, pictures.visible, strict=True)]
+    return causes.root(causes.mean_square(differences[0], differences[1], mask)) / level

@@ -1,0 +1,186 @@
+"""`python -m studies.portraits build|skin|landmarks|fit …`: portraits of known heads, and how close fits come to them.
+
+`build` photographs test heads of the collection under known light; portraits that are there already are kept. `fit`
+fits and scores them and writes `docs/results.md`. `skin` measures on portraits of training heads what the brightness
+of skin and eyes tells of the skin's albedo: the values of `sira_mi.fit.skin`. `landmarks` measures on them, and on the
+collection's training scans, where landmarks of found faces and of the prior's heads are off, and writes both
+corrections.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+from sira_mi.errors import CommandParser, InputError, run_command
+
+
+def main() -> None:
+    parser = CommandParser(prog="python -m studies.portraits", description=__doc__.split("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    portraits = commands.add_parser("build", help="build or resume the benchmark of portraits")
+    portraits.add_argument("--collection", type=Path, required=True, help="folder whose test heads are photographed")
+    portraits.add_argument("--out", type=Path, required=True, help="folder of the benchmark")
+    portraits.add_argument("--hair", type=Path, help="folder of hair that the collection was built with")
+    portraits.add_argument("--ict", type=Path, help="file of ICT-FaceKit that the collection was built with")
+    portraits.add_argument("--valid", type=Path, help="folder of VALID avatars that the collection was built with")
+    portraits.add_argument("--meshes", type=Path, help="folder of meshes that the collection was built with")
+    portraits.add_argument("--hdri", type=Path, help="folder of .exr maps for the outdoor lights; else sun and sky")
+    portraits.add_argument("--sources", nargs="+", metavar="NAME", help="use these sources only, of the collection's")
+    portraits.add_argument("--primary", action="store_true", help="one light of each head instead of three")
+    portraits.add_argument(
+        "--split", choices=("test", "train"), default="test", help="train: for `skin` and `landmarks`, not for scores"
+    )
+    portraits.add_argument("--heads", type=int, default=12, metavar="N", help="how many heads (default: 12)")
+    portraits.add_argument("--size", type=int, default=512, metavar="N", help="of a photo, pixels (default: 512)")
+    portraits.add_argument("--samples", type=int, default=256, metavar="N", help="paths a pixel, a power of 4")
+    portraits.add_argument("--workers", type=int, default=1, help="processes")
+    skin = commands.add_parser("skin", help="measure what photos tell of the level of their skin's albedo")
+    skin.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
+    skin.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    landmarks = commands.add_parser("landmarks", help="measure and correct landmarks of photos and of the prior")
+    landmarks.add_argument("--collection", type=Path, required=True, help="whose training scans the prior is fitted to")
+    landmarks.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
+    landmarks.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
+    landmarks.add_argument(
+        "--out", type=Path, required=True, help="folder for prior.safetensors and head_landmarks.safetensors"
+    )
+    landmarks.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    fits = commands.add_parser("fit", help="fit the benchmark's portraits, score them, write the page")
+    fits.add_argument("--benchmark", type=Path, required=True)
+    fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
+    fits.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
+    fits.add_argument("--quality", choices=("draft", "standard", "high"), default="standard", help="of the shipped fit")
+    fits.add_argument(
+        "--ablations", choices=("draft", "standard", "high"), default="draft", help="quality of all methods"
+    )
+    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.1 to b.7)")
+    fits.add_argument(
+        "--portraits", nargs="+", default=(), metavar="NAME", help="portraits (default: the primary ones)"
+    )
+    fits.add_argument("--all-lights", action="store_true", help="every portrait, not one of each head")
+    fits.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
+    fits.add_argument("--prior-without-deformation", type=Path, metavar="PRIOR", help="for the methods a.1 and a.2")
+    fits.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    arguments = parser.parse_args()
+    run = {"build": make_benchmark, "skin": measure_skin, "landmarks": correct_landmarks, "fit": compare_fits}
+    run[arguments.command](arguments)
+
+
+def compare_fits(arguments: argparse.Namespace) -> None:
+    """Fits and scores the benchmark's portraits as the command line says, and writes the page."""
+    import mitsuba as mi
+
+    from sira_mi.avatar.file import PRIOR
+    from studies.portraits.fits import Comparison, compare, write_rows
+    from studies.portraits.methods import BY_NAME
+    from studies.portraits.results_page import SHIPPED, Described, write_results
+
+    mi.set_variant(arguments.variant)
+
+    def rows(quality: str, methods: tuple[str, ...]) -> list[dict]:
+        comparison = Comparison(
+            arguments.benchmark,
+            arguments.runs / quality,
+            quality,
+            methods,
+            arguments.prior or PRIOR,
+            arguments.prior_without_deformation,
+            primary=not arguments.all_lights,
+            only=tuple(arguments.portraits),
+            variant=arguments.variant,
+        )
+        found = compare(comparison)
+        write_rows(arguments.runs / quality / "rows.json", found)
+        return found
+
+    ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
+    shipped = rows(arguments.quality, (SHIPPED,))
+    described = Described(
+        arguments.benchmark, arguments.runs / arguments.quality, arguments.quality, arguments.ablations
+    )
+    print(f"{write_results(shipped, ablations, described, arguments.out)} written")
+
+
+def measure_skin(arguments: argparse.Namespace) -> None:
+    """Prints what the cues of `sira_mi.fit.skin` tell of the skin's albedo, over a benchmark's portraits."""
+    import mitsuba as mi
+    import numpy as np
+
+    mi.set_variant(arguments.variant)
+    from studies.portraits.skin_level import estimate, observe
+
+    observations, blind = observe(arguments.benchmark)
+    found = estimate(observations)
+    spread = np.std(np.log([o.luminance for o in observations]))
+    print(f"{len(observations)} portraits, log of the skin's luminance within {spread:.2f}; unseen: {len(blind)}")
+    print(f"by skin: error {found.error_by_skin:.2f}; by skin and eyes: error {found.error:.2f}, with")
+    print(", ".join(f"{name} {value:.2f}" for name, value in vars(found.level).items()))
+
+
+def correct_landmarks(arguments: argparse.Namespace) -> None:
+    """Writes the correction of found faces and the prior with its model of landmarks; prints what each mends."""
+    import mitsuba as mi
+
+    mi.set_variant(arguments.variant)
+    from sira_mi.avatar.file import load_avatar, save_avatar
+    from sira_mi.portrait.head_landmarks import CORRECTION
+    from sira_mi.training.scenes import load_training_scenes
+    from studies.portraits import landmark_errors
+    from studies.priors import landmark_places
+
+    prior = landmark_places.bare(load_avatar(arguments.prior))
+    observations, blind = landmark_errors.observe(arguments.benchmark)
+    found, corrected = landmark_errors.held_out_errors(observations)
+    places = landmark_places.places(prior, load_training_scenes(arguments.collection))
+    placed, modelled = landmark_places.held_out_errors(prior, places)
+    make_folder(arguments.out)
+    landmark_errors.fitted_correction(observations).save(arguments.out / CORRECTION.name)
+    save_avatar(arguments.out / "prior.safetensors", landmark_places.with_landmark_model(prior, places))
+    print(
+        f"{len(observations)} portraits of {len({o.head for o in observations})} heads, {len(blind)} without a face: "
+        f"found landmarks {100 * found:.2f}% of the face off, corrected {100 * corrected:.2f}%"
+    )
+    print(f"{len(places.true)} scans: the prior's landmarks {placed:.1f} mm off, modelled {modelled:.1f} mm")
+
+
+def make_folder(folder: Path) -> None:
+    """Raises InputError when it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder}: {error.strerror}; choose another --out") from error
+
+
+def make_benchmark(arguments: argparse.Namespace) -> None:
+    """Builds the benchmark that the command line describes and prints what it holds."""
+    from studies.portraits.benchmark import build_benchmark
+    from studies.portraits.benchmark_plan import BenchmarkSettings, named_sources
+    from studies.portraits.benchmark_portraits import PhotoSettings
+
+    for name in ("workers", "heads"):
+        if getattr(arguments, name) < 1:
+            raise InputError(f"--{name} must be at least 1")
+    if not 64 <= arguments.size <= 4096:
+        raise InputError("--size must be 64 to 4096 pixels")
+    if arguments.samples not in (1, 4, 16, 64, 256, 1024):
+        raise InputError("--samples must be a power of 4 up to 1024")
+    data = {name: getattr(arguments, name) for name in ("hair", "ict", "valid", "meshes")}
+    sources = named_sources(arguments.collection, arguments.split, arguments.sources, data)
+    start = time.monotonic()
+    settings = BenchmarkSettings(
+        identities=arguments.heads,
+        split=arguments.split,
+        primary_only=arguments.primary,
+        photo=PhotoSettings(size=arguments.size, samples=arguments.samples),
+    )
+    entries = build_benchmark(arguments.collection, arguments.out, sources, arguments.hdri, arguments.workers, settings)
+    heads = len({entry["identity"] for entry in entries})
+    hair = len({entry["identity"] for entry in entries if entry["hair"]})
+    print(
+        f"{arguments.out}: {len(entries)} portraits of {heads} heads, {hair} of them with hair, "
+        f"after {time.monotonic() - start:.0f} s"
+    )
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,125 @@
+"""How far a predicted appearance is from the true one, in the photo's pixels.
+
+All images are linear. They are compared inside both masks (coverage above 0.5), one pixel away from their common edge.
+PSNR and SSIM are of sRGB-coded values with peak 1; SSIM is the mean over those pixels of the map with uniform windows
+of 7 x 7 pixels, both images black outside. Specular albedo, reflectance at normal incidence, is compared as strength,
+that is over 0.08, so that it fills the range. `scaled` is after the one factor a channel that is best in least squares
+over the pixels compared: it takes out what the exposure leaves open between light and albedo.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_erosion
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.training.collection.skin import SKIN
+from studies.measures import F0_OF_STRENGTH, channel_scaled, correlation, luminance, psnr, ssim_inside
+from studies.portraits.truth import Truth, check_array
+
+_EDGE = np.ones((3, 3), bool)  # what is eroded: a pixel, its sides and corners
+_DARKEST = 1e-4  # shading below this counts as this, so that it has a logarithm
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedAppearance:
+    """What a method says of a portrait, at the photo's pixels; linear."""
+
+    final: np.ndarray  # [H, W, 3] radiance, exposed as in the photo
+    diffuse_albedo: np.ndarray  # [H, W, 3]
+    specular_albedo: np.ndarray  # [H, W] reflectance at normal incidence
+    mask: np.ndarray  # [H, W] coverage, 0 to 1
+    shaded: np.ndarray  # [H, W, 3] radiance of eq. 8: `final` without the refinement of the light
+
+
+def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str, float]:
+    """All appearance scores of a prediction.
+
+    `final_`, `shaded_`, `diffuse_`, `diffuse_scaled_`, `specular_` and `specular_scaled_` `psnr` (dB) and `ssim`;
+    `skin_ciede2000_mean`, `_median`, and after the scale of the skin's own pixels `skin_scaled_ciede2000_mean`,
+    `_median`; the scores of `leakage_scores`. Counts: `pixels` compared and `skin_pixels` of them; `lost_pixels`, that
+    only the truth covers; `final_`, `shaded_`, `diffuse_` and `specular_nonfinite`, predicted values among those
+    compared that are NaN or infinite: they count as black. Without pixels the scores are NaN. Raises InputError for
+    images that are not of the photo's size."""
+    height, width = truth.mask.shape
+    for name, channels in (("final", 3), ("shaded", 3), ("diffuse_albedo", 3), ("specular_albedo", 1)):
+        shape = (height, width, 3)[: 2 + (channels > 1)]
+        check_array(f"the prediction's {name}", getattr(prediction, name), shape, finite=False)
+    check_array("the prediction's mask", prediction.mask, (height, width))
+
+    covered = truth.mask > 0.5
+    inside = binary_erosion(covered & (prediction.mask > 0.5), _EDGE, border_value=1)
+    skin = inside & (truth.region == SKIN)
+    scores = {
+        "pixels": float(inside.sum()),
+        "skin_pixels": float(skin.sum()),
+        "lost_pixels": float((covered & (prediction.mask <= 0.5)).sum()),
+    }
+    pairs = {
+        "final": (prediction.final, truth.image),
+        "shaded": (prediction.shaded, truth.image),
+        "diffuse": (prediction.diffuse_albedo, truth.diffuse_albedo),
+        "specular": (prediction.specular_albedo / F0_OF_STRENGTH, truth.specular_albedo / F0_OF_STRENGTH),
+    }
+    for name, (values, true) in pairs.items():
+        finite = np.isfinite(values)
+        scores[f"{name}_nonfinite"] = float((~finite)[inside].sum())
+        values = np.where(finite, values, 0).astype(np.float64)
+        scores |= image_scores(f"{name}_", values, true, inside)
+        if name in ("diffuse", "specular"):
+            scores |= image_scores(f"{name}_scaled_", _scaled_inside(values, true, inside), true, inside)
+        if name == "diffuse":
+            albedo = values[skin]
+    true = truth.diffuse_albedo[skin].astype(np.float64)
+    scores |= colour_scores("skin_", albedo, true)
+    scores |= colour_scores("skin_scaled_", channel_scaled(albedo, true), true)
+    scores |= leakage_scores(albedo, true, truth.shading[skin], truth.shadow[skin])
+    return scores
+
+
+def image_scores(prefix: str, values: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> dict[str, float]:
+    """`psnr` and `ssim` of linear images [H, W, 3] or [H, W] inside a mask [H, W] bool."""
+    first, second = linear_to_srgb(values), linear_to_srgb(truth)
+    return {
+        f"{prefix}psnr": psnr(first[inside], second[inside]),
+        f"{prefix}ssim": ssim_inside(first, second, inside),
+    }
+
+
+def colour_scores(prefix: str, albedo: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Mean and median CIEDE2000 difference of linear colours [N, 3], clipped to sRGB's gamut; NaN of nothing."""
+    if not len(truth):
+        return dict.fromkeys((f"{prefix}ciede2000_mean", f"{prefix}ciede2000_median"), float("nan"))
+    difference = deltaE_ciede2000(*(rgb2lab(linear_to_srgb(colour)) for colour in (albedo, truth)))
+    return {
+        f"{prefix}ciede2000_mean": float(difference.mean()),
+        f"{prefix}ciede2000_median": float(np.median(difference)),
+    }
+
+
+def leakage_scores(albedo: np.ndarray, truth: np.ndarray, shading: np.ndarray, shadow: np.ndarray) -> dict[str, float]:
+    """What of the light is left in the albedo, over pixels of albedos [N, 3]: Pearson's correlation of the error of the
+    log albedo's luminance with the log of `shading` [N], `leakage_shading`, and with `shadow` [N], `leakage_shadow`,
+    both absolute, and with their signs `leakage_shading_signed` and `leakage_shadow_signed` (positive: the albedo is
+    too dark where there is little light); `leakage_slope`, the share of log shading that the albedo took over, by
+    linear regression: 0 none, 1 all of it. An error or a light that is constant leaks nothing: 0."""
+    error = np.log(luminance(albedo)) - np.log(luminance(truth))
+    light = np.log(np.maximum(shading.astype(np.float64), _DARKEST))
+    by_shading, by_shadow = correlation(error, light), correlation(error, shadow.astype(np.float64))
+    slope = by_shading * error.std() / max(light.std(), 1e-9) if len(error) else float("nan")
+    return {
+        "leakage_shading": abs(by_shading),
+        "leakage_shading_signed": by_shading,
+        "leakage_shadow": abs(by_shadow),
+        "leakage_shadow_signed": by_shadow,
+        "leakage_slope": float(slope),
+    }
+
+
+def _scaled_inside(values, truth, inside):
+    """An image times the factor of each channel that is best inside the mask, black outside."""
+    image = np.zeros(values.shape)
+    flat = (a[inside].reshape(inside.sum(), values[0, 0].size) for a in (values, truth))
+    image[inside] = channel_scaled(*flat).reshape(values[inside].shape)
+    return image

@@ -1,0 +1,148 @@
+"""The benchmark's portraits, fitted by every method and scored against the truth: rows for the results page."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from tqdm import tqdm
+
+from sira_mi.avatar.file import PRIOR, load_avatar
+from sira_mi.errors import InputError
+from sira_mi.files import write_through
+from sira_mi.fit.settings import QUALITIES
+from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.portrait import PortraitSettings, make_portrait
+from studies.cache import cached, fingerprint
+from studies.portraits.appearance_scores import PredictedAppearance, score_appearance
+from studies.portraits.benchmark import read_benchmark
+from studies.portraits.geometry_scores import PredictedHead, score_geometry, true_surface
+from studies.portraits.methods import BY_NAME, METHODS
+from studies.portraits.run_methods import Job, run
+from studies.portraits.truth import Truth, load_truth
+
+MEAN_HEAD = "mean head"
+_VERSION = "1"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is fitted and scored."""
+
+    benchmark: Path
+    runs: Path  # folder of the fits
+    quality: str = "standard"
+    methods: tuple[str, ...] = tuple(method.name for method in METHODS)
+    prior: Path = PRIOR
+    prior_without_deformation: Path | None = None  # for the methods without deformation
+    primary: bool = True  # one portrait of each identity, not all of its lights
+    only: tuple[str, ...] = ()  # names of portraits; all when empty
+    seed: int = 0
+    variant: str = "llvm_ad_rgb"
+
+
+def compare(comparison: Comparison) -> list[dict]:
+    """Fits and scores: rows of `portrait`, `identity`, `light`, `method`, `scores`, and of a fit `seconds` by stage,
+    `total_seconds` and `peak_memory_megabytes`, or its `error`. What RUNS holds already is not done again."""
+    methods = _complete(comparison.methods)
+    if any(not BY_NAME[name].deforms for name in methods) and comparison.prior_without_deformation is None:
+        raise InputError("methods without deformation need their prior: give --prior-without-deformation")
+    entries = [
+        entry
+        for entry in read_benchmark(comparison.benchmark)
+        if (entry["name"] in comparison.only if comparison.only else entry["primary"] or not comparison.primary)
+    ]
+    if not entries:
+        raise InputError(f"{comparison.benchmark} has no such portraits")
+    rows = []
+    with tqdm(total=len(entries) * (1 + len(methods)), desc="fits", unit="fit") as bar:
+        for entry in entries:
+            for row in _portrait_rows(comparison, entry, methods):
+                rows.append(row)
+                bar.set_postfix_str(f"{row['portrait']} {row['method']}")
+                bar.update()
+    return rows
+
+
+def _complete(names: Sequence[str]) -> list[str]:
+    """The methods and those that they go on from, in the order of `METHODS`."""
+    if unknown := set(names) - set(BY_NAME):
+        raise InputError(f"unknown methods {', '.join(sorted(unknown))}; known are {', '.join(BY_NAME)}")
+    wanted: set[str | None] = set()
+    for name in names:
+        while name not in wanted and name is not None:
+            wanted.add(name)
+            name = BY_NAME[name].after
+    return [method.name for method in METHODS if method.name in wanted]
+
+
+def _portrait_rows(comparison: Comparison, entry: dict, methods: list[str]):
+    folder = comparison.benchmark / entry["name"]
+    truth = surface = None
+
+    def score(path: Path, key: str, head) -> dict:
+        def compute() -> dict:
+            nonlocal truth, surface
+            truth = truth or load_truth(folder / "truth.npz")
+            surface = surface or true_surface(truth)
+            geometry, appearance = head(truth)
+            scores = score_geometry(geometry, truth, surface)
+            return scores if appearance is None else scores | score_appearance(appearance, truth)
+
+        return cached(path, fingerprint(_VERSION, key, folder / "truth.npz"), compute)
+
+    described = {"portrait": entry["name"], "identity": entry["identity"], "light": entry["light"]}
+    mean = comparison.runs / entry["name"] / "mean_head.json"
+    key = fingerprint(comparison.prior, folder / "photo.jpg")
+    scores = score(mean, key, lambda truth: (mean_head(folder / "photo.jpg", comparison.prior), None))
+    yield {**described, "method": MEAN_HEAD, "scores": scores}
+    for name in methods:
+        method = BY_NAME[name]
+        out = comparison.runs / entry["name"] / name
+        job = Job(
+            folder / "photo.jpg",
+            name,
+            comparison.prior if method.deforms else comparison.prior_without_deformation,
+            QUALITIES[comparison.quality],
+            out,
+            None if method.after is None else out.with_name(method.after),
+            comparison.seed,
+            comparison.variant,
+        )
+        result = run(job)
+        row = {**described, "method": name, **{k: v for k, v in result.items() if k not in ("key", "losses")}}
+        if "error" not in result:
+            read = partial(_read_head, out, method.after is not None)
+            row["scores"] = score(out / "scores.json", result["key"], read)
+        yield row
+
+
+def mean_head(photo: Path, prior_path: Path) -> PredictedHead:
+    """What the table compares with: the prior's mean head in the camera that the photo's landmarks give it."""
+    prior = load_avatar(prior_path)
+    portrait = make_portrait(photo, PortraitSettings(), prior.tensors["landmarks"])
+    head = mi.load_dict({"type": "neural_sdf", "avatar": str(prior_path), "voxel": 0.05})
+    faces = mi.traverse(head)["faces"].numpy().reshape(-1, 3)
+    return PredictedHead(head.vertices().T, faces, prior.tensors["landmarks"], portrait.camera)
+
+
+def _read_head(out: Path, shaded: bool, truth: Truth) -> tuple[PredictedHead, PredictedAppearance | None]:
+    height, width = truth.mask.shape
+    with np.load(out / "head.npz", allow_pickle=False) as data:
+        camera = Camera(data["K"], data["world_to_camera"], width, height)
+        image = {name.removeprefix("image/"): data[name] for name in data.files if name.startswith("image/")}
+        head = PredictedHead(data["vertices"], data["faces"], data["landmarks"], camera, image["normal"], image["mask"])
+    if not shaded:
+        return head, None
+    names = ("final", "diffuse_albedo", "specular_albedo", "mask")
+    shaded = image["diffuse"] + image["specular"]
+    return head, PredictedAppearance(**{name: image[name] for name in names}, shaded=shaded)
+
+
+def write_rows(path: Path, rows: list[dict]) -> None:
+    """The rows as JSON, for the page and for other tools."""
+    text = json.dumps(rows, indent=1) + "\n"
+    write_through(path, lambda file: file.write_text(text, encoding="utf-8"))

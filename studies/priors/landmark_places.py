@@ -1,0 +1,66 @@
+"""Where the heads of a prior carry their landmarks, by scans of training heads: the tensors of
+`sira_mi.avatar.landmark_model`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from sira_mi.avatar.file import LANDMARK_MODEL, Avatar
+from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
+from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.errors import InputError
+from sira_mi.training.landmark_regression import landmark_tensors
+from sira_mi.training.scenes import TrainingScene
+from sira_mi.training.shape_model import ShapeModel
+from studies.priors.shape_prior import ShapeFit, fit_shape
+
+_FOLDS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The landmarks of some heads, in scene units."""
+
+    placed: np.ndarray  # [S, 468, 3] where the prior's field has them, NaN where the mean head has none
+    true: np.ndarray  # [S, 468, 3], NaN where unknown
+
+
+def bare(prior: Avatar) -> Avatar:
+    """The prior without a model of landmarks. Raises InputError where there is no deformation to carry landmarks."""
+    if not prior.architecture.deforms:
+        raise InputError("a prior without deformation has no landmarks in reference space; give another --prior")
+    kept = {name: values for name, values in prior.tensors.items() if name not in LANDMARK_MODEL}
+    return Avatar(prior.architecture, kept, prior.roughness, prior.k_s, prior.k_r)
+
+
+def places(prior: Avatar, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None) -> Places:
+    """The landmarks of scanned heads and of the prior's heads that are fitted to the scans."""
+    model, prior = ShapeModel.of_prior(prior), bare(prior)
+    w = fit_shape(model, scenes, fit)
+    placed = [landmarks_of(prior, model.field(model.latent("z_sdf", w[:, k]))) for k in range(len(scenes))]
+    return Places(np.stack(placed), np.stack([scene.landmarks for scene in scenes]))
+
+
+def with_landmark_model(prior: Avatar, found: Places) -> Avatar:
+    return prior.replaced(**landmark_tensors(prior, found.placed, found.true))
+
+
+def held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
+    """Mean distance in mm of placed landmarks to the true ones, and of modelled ones, each head by what the others
+    tell. Raises InputError for too few heads."""
+    count = len(found.placed)
+    if count < 2 * _FOLDS:
+        raise InputError(f"{count} training heads: {2 * _FOLDS} are needed")
+    known = np.isfinite(prior.tensors["landmarks"]).all(axis=1)
+    fold = np.arange(count) % _FOLDS
+    modelled = np.full_like(found.placed, np.nan)
+    for k in range(_FOLDS):
+        others = Places(found.placed[fold != k], found.true[fold != k])
+        model = LandmarkModel(with_landmark_model(prior, others))
+        for head in np.flatnonzero(fold == k):
+            placed = mi.TensorXf(np.ascontiguousarray(found.placed[head, known].T))
+            modelled[head, known] = model(placed).numpy().T
+    errors = [np.linalg.norm(landmarks - found.true, axis=2) for landmarks in (found.placed, modelled)]
+    return tuple(float(np.nanmean(error)) * MILLIMETRES_PER_UNIT for error in errors)

@@ -1,0 +1,56 @@
+"""`python -m studies.stability [--only SECTION …]`: measures every row and writes the page of numerical stability.
+
+The fits take half an hour; those that are finished are kept in `--work` and done again only when something that they
+depend on has changed. Sections that are not measured stay on the page as they were. Ends with 1 when a row misses its
+bound."""
+
+import time
+from pathlib import Path
+
+from sira_mi.errors import CommandParser, InputError, run_command
+
+
+def main() -> int:
+    parser = CommandParser(prog="python -m studies.stability", description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
+    parser.add_argument("--work", type=Path, default=Path("build/stability"), help="folder of portraits and fits")
+    parser.add_argument("--only", nargs="+", metavar="SECTION", help="measure only these sections: fits, tracing, ...")
+    parser.add_argument("--quick", action="store_true", help="fewer cases, as in the tests")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
+    arguments = parser.parse_args()
+    if not arguments.out.is_dir():
+        raise InputError(f"{arguments.out} is not a folder; make it, or give another with --out")
+
+    import mitsuba as mi
+
+    mi.set_variant(arguments.variant)
+
+    from studies.stability.page import Measured, load_rows, write_page
+    from studies.stability.sections import all_sections
+
+    sections = all_sections(arguments.work)
+    if unknown := set(arguments.only or ()) - set(sections):
+        raise InputError(f"unknown sections {', '.join(sorted(unknown))}; known are {', '.join(sections)}")
+    measured = {name: part for name, part in load_rows(arguments.out).items() if name in sections}
+    start, passed = time.monotonic(), True
+    for name in arguments.only or sections:
+        rows = []
+        for measure in sections[name].measures:
+            began = time.monotonic()
+            row = measure(arguments.quick)
+            verdict = "met" if row.passed else "MISSED"
+            print(
+                f"{verdict:6} {row.name}: {row.error:.2g}, bound {row.bound:.3g}, {row.non_finite} not finite "
+                f"({row.cases} cases, {time.monotonic() - began:.0f} s)",
+                flush=True,
+            )
+            rows.append(row)
+            passed &= row.passed
+        measured[name] = Measured(arguments.quick, tuple(rows))
+        path = write_page(arguments.out, sections, measured)
+    print(f"{path} written after {time.monotonic() - start:.0f} s")
+    return int(not passed)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,35 @@
+"""Portraits with known truth that anyone can take again: a MakeHuman head of the shipped pack, path traced.
+
+Its number makes it a test head of any collection, and its seed is none of a collection's heads', so that no prior was
+trained on it."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+from sira_mi.training.collection.sources.makehuman import MakeHumanSource
+from studies.portraits.benchmark import take_portraits
+from studies.portraits.benchmark_plan import Identity, Pose, Shot
+from studies.portraits.benchmark_portraits import PhotoSettings
+
+NUMBER, SEED = 7, 800_103
+FOCAL_35MM = 70.0  # mm
+# Name and yaw in degrees of each portrait.
+YAWS = {"front": 12.0, "turned": 50.0, "profile": 85.0}
+_PHOTO = PhotoSettings(size=512, samples=64, depth=5, shading_samples=4)
+
+
+@cache
+def truth_portrait(folder: Path, view: str) -> Path:
+    """The folder, inside `folder`, of the portrait `view` of `YAWS`, with its `photo.jpg` and `truth.npz`; it is taken
+    now unless it is there already. Raises InputError when it cannot be written."""
+    source = MakeHumanSource(NUMBER + 1, None)
+    subject = source.subject(NUMBER, SEED)
+    person = json.loads(json.dumps(subject.description))
+    identity = Identity(source.name, NUMBER, SEED, subject.group, person, "unknown", hair=False, clothes=True)
+    pose = Pose(YAWS[view], pitch=2.0, focal_35mm=FOCAL_35MM, extent=4.6)
+    shot = Shot(identity, pose, "studio", "side", environment=None, primary=True, seed=SEED)
+    out = folder / view
+    out.mkdir(parents=True, exist_ok=True)
+    take_portraits((source, [shot]), out, _PHOTO)
+    return out / shot.name
