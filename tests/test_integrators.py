@@ -439,6 +439,6 @@ def test_modelled_pixels_are_those_whose_rays_leave_the_box_through_a_wall():
 
 def test_orbiting_turns_the_view_about_the_vertical_axis():
     """Turned by +90° to its left, the head shows its right side: the camera stands at −x."""
-    turned = scenes.orbited(camera(36), 90.0)
+    turned = scenes.orbit(camera(36), 90.0)
     np.testing.assert_allclose(turned.centre, [-5, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(scenes.orbited(camera(36), 0.0).centre, [0, 0, 5], atol=1e-9)
+    np.testing.assert_allclose(scenes.orbit(camera(36), 0.0).centre, [0, 0, 5], atol=1e-9)

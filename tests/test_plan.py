@@ -15,7 +15,7 @@ from conftest import camera, small_avatar, tiny_fit
 from sira_mi.avatar.file import PRIOR, load_avatar, save_avatar
 from sira_mi.decisions import Decision, Plan, explain
 from sira_mi.errors import InputError
-from sira_mi.export.scene import orbited
+from sira_mi.export.scene import orbit
 from sira_mi.fit.driver import Progress, run_stages
 from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
 from sira_mi.fit.leave_out import plan_fit
@@ -24,15 +24,15 @@ from sira_mi.fit.settings import APPEARANCE
 from sira_mi.relight import measure
 from sira_mi.relight.__main__ import main as relight
 from sira_mi.relight.leave_out import TOLERANCE, image_lobes, largest_reflectance, plan_relight
-from sira_mi.relight.measure import measured
-from sira_mi.relight.render import RelightSettings, head_window, load_head, render_passes, turned_scene
+from sira_mi.relight.measure import measure_plan
+from sira_mi.relight.render import RelightSettings, head_window, load_head, load_scene, render_passes
 from sira_mi.relight.subject import Light, Subject
 from sira_mi.relight.surface import Surface, bounced_radiance, sample_surface
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
 from sira_mi.sg.lobes import fibonacci_directions
 from sira_mi.sg.shading import shade_tensor
-from sira_mi.sg.weak_lobes import needed_lobes, radiance_bounds, white_radiance
+from sira_mi.sg.weak_lobes import radiance_bounds, select_lobes, white_radiance
 from studies.leave_out.page import commands, plan_table
 
 # A key, a dome and three lobes that are far too dim to be seen.
@@ -71,7 +71,7 @@ def everything(integrator: str, **options) -> RelightSettings:
 
 
 def picture(subject, light, settings, yaw=0.0):
-    return render_passes(turned_scene(load_head(subject, settings), subject.camera, light, yaw, settings), settings)[
+    return render_passes(load_scene(load_head(subject, settings), subject.camera, light, yaw, settings), settings)[
         ..., :3
     ]
 
@@ -116,9 +116,9 @@ def test_white_is_no_brighter_than_a_surface_can_be():
 
 def test_the_weakest_lobes_go_together():
     bounds = np.array([3.0, 1e-4, 5e-4, 1.0, 3e-4])
-    assert needed_lobes(bounds, 1e-3).tolist() == [0, 3]
-    assert needed_lobes(bounds, 3.9e-4).tolist() == [0, 2, 3, 4]
-    assert needed_lobes(bounds, 100.0).tolist() == [0], "the strongest stays"
+    assert select_lobes(bounds, 1e-3).tolist() == [0, 3]
+    assert select_lobes(bounds, 3.9e-4).tolist() == [0, 2, 3, 4]
+    assert select_lobes(bounds, 100.0).tolist() == [0], "the strongest stays"
 
 
 def test_bounces_in_a_closed_room_are_powers_of_the_albedo():
@@ -170,7 +170,7 @@ def test_closed_form_pictures_with_and_without_the_plan(blob):
     plan = plan_relight(blob, light, load_head(blob, settings), settings, [20.0])
     found = by_name(plan)
     assert found["weak lobes"].changes["kept_lobes"] == (0, 2)
-    assert found["extra channels"].left_out and not found["speculars"].left_out
+    assert found["extra channels"].left_out and not found["specular term"].left_out
     white, reference = white_radiance(LOBES), picture(blob, light, settings, 20.0)
     for decision in plan.decisions:
         assert not decision.left_out or decision.bound <= TOLERANCE
@@ -230,26 +230,26 @@ def test_late_bounces_add_less_than_their_bound(mean_head):
     white = white_radiance(light.lobes)
     pictures = {}
     for one in (2, depth, depth + 10):
-        scene = turned_scene(shape, mean_head.camera, light, 0.0, replace(settings, max_depth=one))
+        scene = load_scene(shape, mean_head.camera, light, 0.0, replace(settings, max_depth=one))
         pictures[one] = render_passes(scene, settings)[..., :3].reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
     lost = pictures[depth + 10] - pictures[depth]
     assert np.abs(lost).max() <= decision.bound * white + 0.002 * white, "noise of 4608 samples a block"
     assert (pictures[depth + 10] - pictures[2]).max() > 0.002 * white, "there are bounces"
 
 
-def test_without_speculars_nothing_of_them_is_computed(avatar, tmp_path):
-    """k_s = 0: the plan leaves the speculars out; the closed form does not change, path tracing only by its noise."""
+def test_without_a_specular_term_nothing_of_it_is_computed(avatar, tmp_path):
+    """k_s = 0: the plan leaves the specular term out; the closed form does not change, path tracing only by its noise."""
     save_avatar(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0))
     matt = Subject(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0), camera(40.0, SIZE))
     light = Light(LOBES)
     for integrator, samples, allowed in (("sg", 4, 1e-6), ("path", 256, 0.02)):
         settings = everything(integrator, samples=samples)
         shape = load_head(matt, settings)
-        decision = by_name(plan_relight(matt, light, shape, settings, [0.0]))["speculars"]
+        decision = by_name(plan_relight(matt, light, shape, settings, [0.0]))["specular term"]
         assert decision.left_out and decision.bound == 0
         almost = Subject(matt.path, replace(matt.avatar, k_s=1e-9), matt.camera)
         first = picture(almost, light, settings).reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
-        second = picture(matt, light, replace(settings, speculars=False)).reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
+        second = picture(matt, light, replace(settings, specular=False)).reshape(4, 6, 4, 6, 3).mean(axis=(1, 3))
         np.testing.assert_allclose(second, first, rtol=0, atol=allowed * first.max())
         assert first.max() > 0.1
 
@@ -261,12 +261,12 @@ def test_no_ray_beside_the_window_meets_the_head(blob, mean_head):
         settings = everything("sg", visibility=False)
         shape = load_head(subject, settings)
         for yaw in (0.0, 70.0):
-            image = render_passes(turned_scene(shape, subject.camera, Light(LOBES), yaw, settings), settings)
-            x, y, width, height = head_window(shape, orbited(subject.camera, yaw))
+            image = render_passes(load_scene(shape, subject.camera, Light(LOBES), yaw, settings), settings)
+            x, y, width, height = head_window(shape, orbit(subject.camera, yaw))
             rows, columns = np.nonzero(image[..., 3] > 0)
             assert x <= columns.min() and columns.max() < x + width and columns.min() - x < 4
             assert y <= rows.min() and rows.max() < y + height and rows.min() - y < 4
-            cropped = turned_scene(shape, subject.camera, Light(LOBES), yaw, replace(settings, crop=True))
+            cropped = load_scene(shape, subject.camera, Light(LOBES), yaw, replace(settings, crop=True))
             cropped = render_passes(cropped, settings)
             assert cropped.shape == image.shape
             both = (image[..., 3] == 1) & (cropped[..., 3] == 1)
@@ -294,7 +294,7 @@ def test_an_image_is_planned_by_lobes_of_its_light():
 def test_what_is_measured_stays_below_its_bound(blob):
     light, settings = Light(LOBES), everything("sg")
     plan = plan_relight(blob, light, load_head(blob, settings), settings, [0.0])
-    for decision in measured(plan, blob, light, settings, 0.0, size=16).decisions:
+    for decision in measure_plan(plan, blob, light, settings, 0.0, size=16).decisions:
         if decision.left_out and decision.changes:
             assert decision.error <= decision.bound + 1.5 * decision.noise + 1e-6, decision.name
             assert decision.saved is not None
@@ -374,7 +374,7 @@ def test_relight_explains_and_keeps_all(avatar_path, tmp_path, monkeypatch, caps
     ]
     assert relight([*common, "--explain", "--out", str(tmp_path / "planned")]) == 0
     words = capsys.readouterr().out
-    for name in ("weak lobes", "visibility", "extra channels", "pixels beside the head", "speculars", "refinement"):
+    for name in ("weak lobes", "visibility", "extra channels", "pixels beside the head", "specular term", "refinement"):
         assert name in words
     assert "measured" in words and "time saved" in words
     assert relight([*common, "--keep-all", "--out", str(tmp_path / "all")]) == 0

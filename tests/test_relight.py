@@ -22,7 +22,7 @@ from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module
 from sira_mi.relight.__main__ import main
 from sira_mi.relight.compare import compare
-from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
+from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes
 from sira_mi.relight.subject import Light, Subject, read_light, read_subject
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
@@ -112,10 +112,10 @@ def test_baked_albedos_have_no_gradients_and_no_place_outside_of_a_head(avatar_p
 
 @pytest.mark.parametrize("integrator, kind", [("sg", "lobes"), ("path", "lobes"), ("path", "image")])
 def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
-    """`turned_scene` moves camera and light; `to_world` of the shape turns the head itself."""
+    """`load_scene` moves camera and light; `to_world` of the shape turns the head itself."""
     settings = RelightSettings(integrator=integrator, samples=16 if integrator == "sg" else 64, voxel=0.1)
     light = Light(LOBES) if kind == "lobes" else Light(None, render_environment(LOBES, 32))
-    scene = turned_scene(load_head(subject, settings), VIEW, light, 40.0, settings)
+    scene = load_scene(load_head(subject, settings), VIEW, light, 40.0, settings)
     description = head(subject.path, 0.1, to_world=mi.ScalarTransform4f().rotate([0, 1, 0], 40.0))
     for texture in ("diffuse_albedo", "specular_albedo"):
         description["bsdf"][texture]["baked"] = integrator == "path"
@@ -125,7 +125,7 @@ def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
             "integrator": {"type": "sira_sg" if integrator == "sg" else "path", "hide_emitters": True},
             "sensor": sensor(VIEW, {"type": "multijitter" if integrator == "sg" else "independent"}),
             "head": description,
-            "light": light.turned(np.eye(3)),
+            "light": light.emitter(np.eye(3)),
         }
     )
     first, second = (render_passes(s, settings)[..., :3] for s in (scene, expected))
@@ -147,7 +147,7 @@ def test_closed_form_agrees_with_path_tracing_on_a_convex_head(subject):
 
 def test_passes_add_up_and_repeat(subject, monkeypatch):
     settings = RelightSettings(samples=10, voxel=0.2)
-    scene = turned_scene(load_head(subject, settings), VIEW, Light(LOBES), 0.0, settings)
+    scene = load_scene(load_head(subject, settings), VIEW, Light(LOBES), 0.0, settings)
     monkeypatch.setattr(render_module, "_PASS_RAYS", 4 * 32 * 32)
     counts = []
     image = render_passes(scene, settings, counts.append)

@@ -63,7 +63,7 @@ def head(avatar: str | Path, voxel: float = 0.05, **options) -> dict:
     }
 
 
-def orbited(camera: Camera, yaw_degrees: float) -> Camera:
+def orbit(camera: Camera, yaw_degrees: float) -> Camera:
     """The camera moved about the world's y axis so that the head appears turned by `yaw_degrees` to its left."""
     angle = np.radians(yaw_degrees)
     turn = np.eye(4)

@@ -20,7 +20,7 @@ import sira_mi
 from sira_mi.avatar.file import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
 from sira_mi.decisions import Plan, explain
 from sira_mi.errors import InputError
-from sira_mi.export.scene import orbited
+from sira_mi.export.scene import orbit
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
@@ -308,7 +308,7 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     close = output.box_camera(portrait.camera, box)
     turned = []
     for yaw in (-30, 30):
-        camera = orbited(close, yaw)
+        camera = orbit(close, yaw)
         view = output.avatar_scene(str(avatar_path), camera, output.SECOND_LIGHT, settings.voxel, extra_channels=False)
         turned.append(linear_to_srgb(output.render_radiance(view)))
     write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))

@@ -10,7 +10,7 @@ import numpy as np
 
 from sira_mi.decisions import Decision, Plan
 from sira_mi.fit.settings import APPEARANCE, FitSettings, Stage
-from sira_mi.relight.measure import saved_time
+from sira_mi.relight.measure import measure_saving
 
 
 def measured_fit(plan: Plan, problem, settings: FitSettings, tensors: dict[str, np.ndarray]) -> Plan:
@@ -34,7 +34,7 @@ def measured_fit(plan: Plan, problem, settings: FitSettings, tensors: dict[str, 
         kept = Plan((replace(decision, left_out=False),))
         first, second = gradient(stage, kept), gradient(stage, Plan((decision,)))
         error = float(np.abs(second - first).max() / max(np.abs(first).max(), 1e-30))
-        saved, spread = saved_time(lambda: gradient(stage, kept), lambda: gradient(stage, Plan((decision,))))
+        saved, spread = measure_saving(lambda: gradient(stage, kept), lambda: gradient(stage, Plan((decision,))))
         return replace(decision, error=error, saved=saved, saved_spread=spread)
 
     return Plan(tuple(measure(d) if d.left_out and not d.built_in else d for d in plan.decisions))

@@ -108,12 +108,12 @@ def output_stem(out: Path) -> Path:
     return stem
 
 
-def _planned(subject, light, settings, yaws: list[float], options: argparse.Namespace) -> tuple:
+def _plan_pictures(subject, light, settings, yaws: list[float], options: argparse.Namespace) -> tuple:
     """The settings of the pictures at `yaws`, and the head for them, as `--keep-all` and the plan say; `--explain`
     prints the plan."""
     from sira_mi.decisions import explain
     from sira_mi.relight.leave_out import plan_relight
-    from sira_mi.relight.measure import measured
+    from sira_mi.relight.measure import measure_plan
     from sira_mi.relight.render import load_head
 
     everything = replace(settings, exact=settings.integrator == "path")
@@ -122,9 +122,9 @@ def _planned(subject, light, settings, yaws: list[float], options: argparse.Name
     shape = load_head(subject, settings)
     plan = plan_relight(subject, light, shape, everything, yaws, exact=settings.exact)
     if options.explain:
-        print(explain(measured(plan, subject, light, everything, yaws[0])), flush=True)
+        print(explain(measure_plan(plan, subject, light, everything, yaws[0])), flush=True)
     chosen = (plan.keeping() if options.keep_all else plan).apply(everything)
-    reloaded = (chosen.exact, chosen.speculars) != (settings.exact, settings.speculars)
+    reloaded = (chosen.exact, chosen.specular) != (settings.exact, settings.specular)
     return chosen, load_head(subject, chosen) if reloaded else shape
 
 
@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     from tqdm import tqdm
 
     from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare
-    from sira_mi.relight.render import RelightSettings, render_passes, turned_scene, write_image
+    from sira_mi.relight.render import RelightSettings, load_scene, render_passes, write_image
     from sira_mi.relight.subject import read_light, read_subject
     from sira_mi.variants import set_variant
 
@@ -170,10 +170,10 @@ def main(arguments: list[str] | None = None) -> int:
     frames = options.turntable or 1
     digits = max(3, len(str(frames - 1)))
     yaws = [options.yaw + 360 * frame / frames for frame in range(frames)]
-    settings, shape = _planned(subject, light, settings, yaws, options)
+    settings, shape = _plan_pictures(subject, light, settings, yaws, options)
     with tqdm(total=frames * settings.samples, unit="spp", disable=None) as bar:
         for frame, yaw in enumerate(yaws):
-            scene = turned_scene(shape, subject.camera, light, yaw, settings)
+            scene = load_scene(shape, subject.camera, light, yaw, settings)
             radiance = render_passes(scene, settings, bar.update)[..., :3]
             name = f"{stem.name}_{frame:0{digits}d}" if options.turntable else stem.name
             write_image(stem.with_name(name), radiance, options.exposure)

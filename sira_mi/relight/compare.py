@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.relight.pictures import LAYERS, psnr_inside
-from sira_mi.relight.render import RelightSettings, load_head, render_passes, turned_scene
+from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes
 from sira_mi.relight.subject import Light, Subject
 
 # Samples a pixel of the closed form, which only its outlines need.
@@ -33,7 +33,7 @@ def compare(subject: Subject, light: Light, yaw_degrees: float, settings: Religh
     shape = load_head(subject, traced)
     images, seconds = [], []
     for one in (closed_form, traced):
-        scene = turned_scene(shape, subject.camera, light, yaw_degrees, one)
+        scene = load_scene(shape, subject.camera, light, yaw_degrees, one)
         start = time.monotonic()
         images.append(render_passes(scene, one, done))
         seconds.append(time.monotonic() - start)

@@ -6,22 +6,22 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.decisions import Decision, Plan
-from sira_mi.export.scene import orbited
+from sira_mi.export.scene import orbit
 from sira_mi.relight.render import RelightSettings, head_window
 from sira_mi.relight.subject import Light, Subject
 from sira_mi.relight.surface import (
     Surface,
     baking_error,
     bounced_radiance,
+    find_visible,
     sample_surface,
-    seen_from,
     shadow_error,
     sharing_error,
 )
 from sira_mi.sg.fit_environment import pixel_directions, sphere_integral
 from sira_mi.sg.multisampling import REACH
 from sira_mi.sg.shading import shade_tensor
-from sira_mi.sg.weak_lobes import needed_lobes, radiance_bounds, white_radiance
+from sira_mi.sg.weak_lobes import radiance_bounds, select_lobes, white_radiance
 
 # Largest error of each decision: a thousandth of the radiance of a white diffuse surface that faces the light best, a
 # ninth of the step of an 8-bit sRGB picture near white and three steps at black.
@@ -61,7 +61,7 @@ def plan_relight(
     total = 1 + float(sum(part.max() for part in again)) if path else 1.0
 
     views = [yaws[k] for k in np.unique(np.linspace(0, len(yaws) - 1, min(_VIEWS, len(yaws))).round().astype(int))]
-    decisions = [_speculars(lobes, avatar, reflectance, white, total, limit)]
+    decisions = [_specular_term(lobes, avatar, reflectance, white, total, limit)]
     if light.image is None:
         decisions.append(_weak_lobes(lobes, avatar, reflectance, float(points.albedo.max()), white, total, tolerance))
     decisions.append(Decision("refinement", _PICTURE, avatar.k_r == 0, f"k_r is {avatar.k_r:g}", built_in=True))
@@ -110,16 +110,16 @@ def largest_reflectance(specular_albedo: float, roughness: float) -> float:
     return _CLOSED_FORM_ERROR * float(specular.numpy().max())
 
 
-def _speculars(lobes, avatar, reflectance, white, total, limit):
+def _specular_term(lobes, avatar, reflectance, white, total, limit):
     most = float(radiance_bounds(lobes, avatar.roughness, avatar.k_s, 0.0, reflectance).sum()) * total
     few = most <= limit
     reason = "k_s is 0" if avatar.k_s == 0 else f"they may add {most / white:.1e} of white"
-    return Decision("speculars", _PICTURE, few, reason, most / white, changes={"speculars": False})
+    return Decision("specular term", _PICTURE, few, reason, most / white, changes={"specular": False})
 
 
 def _weak_lobes(lobes, avatar, reflectance, albedo, white, total, tolerance):
     bounds = total * radiance_bounds(lobes, avatar.roughness, avatar.k_s, albedo, reflectance)
-    kept = needed_lobes(bounds, tolerance * white)
+    kept = select_lobes(bounds, tolerance * white)
     weak = np.setdiff1d(np.arange(len(lobes)), kept)
     reason = f"{len(weak)} of {len(lobes)} are too weak to matter together"
     changes = {"kept_lobes": tuple(int(k) for k in kept)}
@@ -139,7 +139,7 @@ def _bounces(shape, points: Surface, subject, lobes, reflectance, white, limit, 
     avatar = subject.avatar
     tails = []
     for yaw in views:
-        seen = seen_from(shape, points, orbited(subject.camera, yaw).centre)
+        seen = find_visible(shape, points, orbit(subject.camera, yaw).centre)
         parts = bounced_radiance(points, _lobes_at(lobes, yaw), avatar.roughness, avatar.k_s, reflectance)
         largest = [float(part[seen].max()) if len(seen) else 0.0 for part in parts]
         tails.append(_MARGIN * np.cumsum(largest[::-1])[::-1])
@@ -167,8 +167,8 @@ def _networks(shape, lobes, avatar, white, total, exact):
 def _visibility(shape, points, subject, lobes, white, limit, views):
     avatar, worst = subject.avatar, 0.0
     for yaw in views:
-        centre = orbited(subject.camera, yaw).centre
-        seen = points.at(seen_from(shape, points, centre))
+        centre = orbit(subject.camera, yaw).centre
+        seen = points.at(find_visible(shape, points, centre))
         error = shadow_error(shape, seen, centre, _lobes_at(lobes, yaw), avatar.roughness, avatar.k_s, _DIRECTIONS)
         worst = max(worst, _MARGIN * error)
         if worst > limit:
@@ -186,7 +186,7 @@ def _shadings(shape, subject, lobes, white, limit, settings, views):
         return Decision(name, _PICTURE, False, "there is one sample a pixel")
     avatar, worst = subject.avatar, 0.0
     for yaw in views:
-        camera = orbited(subject.camera, yaw)
+        camera = orbit(subject.camera, yaw)
         footprint = np.linalg.norm(camera.centre - shape.vertices().mean(axis=1)) / camera.K[0, 0]
         reach = min(REACH, 2 * footprint)
         error = sharing_error(
@@ -204,7 +204,7 @@ def _outside(subject, shape, settings, yaws):
         return Decision("pixels beside the head", _PICTURE, False, "asked for by --background")
     shares = []
     for yaw in yaws:
-        _, _, width, height = head_window(shape, orbited(subject.camera, yaw))
+        _, _, width, height = head_window(shape, orbit(subject.camera, yaw))
         shares.append(width * height / (subject.camera.width * subject.camera.height))
     reason = f"the head's rectangle is {100 * float(np.mean(shares)):.0f} % of the picture"
     return Decision("pixels beside the head", _PICTURE, True, reason, changes={"crop": True})

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError
-from sira_mi.export.scene import head, orbited, sensor
+from sira_mi.export.scene import head, orbit, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_exr, write_png
 from sira_mi.portrait.camera import Camera
@@ -33,7 +33,7 @@ class RelightSettings:
     exact: bool = False  # path tracing evaluates the albedo networks at every hit instead of once a vertex
     background: bool = False  # show the environment behind the head
     voxel: float = 0.03  # of the mesh that is traced, scene units
-    speculars: bool = True  # k_s r^s
+    specular: bool = True  # k_s r^s
     max_depth: int = -1  # path: edges from the camera to the light; -1 for any number
     visibility: bool = True  # sg: shadows and one bounce
     shared: bool = False  # sg: samples of a pixel that see almost the same place share one shading
@@ -55,11 +55,11 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
     description = head(subject.path.absolute(), settings.voxel)
     bsdf = description["bsdf"]
     bsdf["roughness"] = subject.avatar.roughness
-    bsdf["k_s"] = subject.avatar.k_s if settings.speculars else 0.0
+    bsdf["k_s"] = subject.avatar.k_s if settings.specular else 0.0
     if settings.on_mesh if settings.integrator == "sg" else not settings.exact:
         for texture in ("diffuse_albedo", "specular_albedo"):
             bsdf[texture]["baked"] = True
-    if settings.integrator == "path" and not settings.speculars:
+    if settings.integrator == "path" and not settings.specular:
         description["bsdf"] = {"type": "diffuse", "reflectance": bsdf["diffuse_albedo"]}
     try:
         return mi.load_dict(description)
@@ -69,7 +69,7 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
         raise InputError(f"{subject.path}: the field has no surface inside the domain; fit the photo again") from error
 
 
-def turned_scene(
+def load_scene(
     shape: mi.Shape, camera: Camera, light: Light, yaw_degrees: float, settings: RelightSettings
 ) -> mi.Scene:
     """The head turned by `yaw_degrees` to its left about the world's y axis, before a fixed camera, under a fixed
@@ -79,7 +79,7 @@ def turned_scene(
     integrator = {"type": INTEGRATORS[settings.integrator], "hide_emitters": not settings.background}
     if settings.integrator == "path":
         integrator["max_depth"] = settings.max_depth
-        light = light.only(settings.kept_lobes)
+        light = light.select(settings.kept_lobes)
     else:
         integrator |= {
             "visibility": settings.visibility,
@@ -89,14 +89,14 @@ def turned_scene(
         }
         if settings.kept_lobes is not None:
             integrator["shaded_lobes"] = mi.TensorXf(np.array(settings.kept_lobes, np.float32))
-    view = orbited(camera, yaw_degrees)
+    view = orbit(camera, yaw_degrees)
     # Closed forms are smooth: samples that are spread evenly serve their outlines best.
     eye = sensor(view, {"type": "independent" if settings.integrator == "path" else "multijitter"})
     if settings.crop:
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         eye["film"] |= dict(zip(names, head_window(shape, view), strict=True))
     return mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": light.turned(back)}
+        {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": light.emitter(back)}
     )
 
 

@@ -33,7 +33,7 @@ class Subject:
     avatar: Avatar
     camera: Camera
 
-    def scaled(self, size: int) -> Subject:
+    def resize(self, size: int) -> Subject:
         """The same in a picture whose longer side has `size` pixels."""
         longer = max(self.camera.width, self.camera.height)
         width, height = (max(1, round(side * size / longer)) for side in (self.camera.width, self.camera.height))
@@ -51,11 +51,11 @@ class Light:
     lobes: np.ndarray | None
     image: np.ndarray | None = None
 
-    def only(self, numbers: tuple[int, ...] | None) -> Light:
+    def select(self, numbers: tuple[int, ...] | None) -> Light:
         """The light of some of the lobes; None for all."""
         return self if numbers is None else Light(self.lobes[list(numbers)], self.image)
 
-    def turned(self, rotation: np.ndarray) -> dict:
+    def emitter(self, rotation: np.ndarray) -> dict:
         """The emitter for `mi.load_dict`, turned by `rotation` [3, 3]: `envmap` of the image if there is one, else
         `sg_envmap`."""
         if self.image is not None:
@@ -79,7 +79,7 @@ def read_subject(path: Path, size: int | None = None) -> Subject:
     avatar = load_avatar(file)
     report = file.with_name("avatar.json")
     subject = Subject(file, avatar, _read_camera(report) if report.is_file() else PORTRAIT_CAMERA)
-    return subject if size is None else subject.scaled(size)
+    return subject if size is None else subject.resize(size)
 
 
 def _read_camera(report: Path) -> Camera:

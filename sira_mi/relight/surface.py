@@ -79,7 +79,7 @@ def _neighbours(shape, x, normal):
     return neighbour.reshape(_DIRECTIONS, count)
 
 
-def seen_from(shape, points: Surface, centre: np.ndarray) -> np.ndarray:
+def find_visible(shape, points: Surface, centre: np.ndarray) -> np.ndarray:
     """Indices of the points that a camera at `centre` [3] sees."""
     scene, offset = mi.load_dict({"type": "scene", "head": shape}), SHADOW_OFFSET * shape.voxel
     towards = centre[:, None] - points.point

@@ -37,7 +37,7 @@ def white_radiance(lobes: np.ndarray) -> float:
     return float((facing @ (facing_irradiance(lobes[:, 3])[:, None] * lobes[:, 4:])).max() / np.pi)
 
 
-def needed_lobes(bounds: np.ndarray, limit: float) -> np.ndarray:
+def select_lobes(bounds: np.ndarray, limit: float) -> np.ndarray:
     """Indices, in order, of the lobes that are left when the weakest go whose `bounds` [N_l] add up to at most `limit`;
     the strongest always stays."""
     order = np.argsort(bounds, kind="stable")

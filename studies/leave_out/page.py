@@ -21,7 +21,7 @@ from sira_mi.fit.leave_out import plan_fit
 from sira_mi.fit.measure import measured_fit
 from sira_mi.fit.settings import APPEARANCE, QUALITIES
 from sira_mi.relight.leave_out import TOLERANCE, plan_relight
-from sira_mi.relight.measure import measured
+from sira_mi.relight.measure import measure_plan
 from sira_mi.relight.render import RelightSettings, load_head
 from sira_mi.relight.subject import Light, Subject, read_light, read_subject
 
@@ -102,7 +102,7 @@ def _relight_sections(cases: list[tuple[str, str, Subject, Light]], size: int, v
         settings = RelightSettings(integrator, exact=integrator == "path", voxel=voxel)
         shape = load_head(one, replace(settings, exact=False))
         plan = plan_relight(one, lit, shape, settings, [0.0])
-        plan = measured(plan, one, lit, settings, 0.0, size)
+        plan = measure_plan(plan, one, lit, settings, 0.0, size)
         sections.append(f"### {title}\n\n{plan_table(plan)}\n")
         print(f"measured: {title}", flush=True)
     return sections
@@ -126,7 +126,7 @@ def write_page(folder: Path, avatar: Path, lights: Path | None, size: int, voxel
         dark = Path(work) / "avatar.safetensors"
         save_avatar(dark, replace(subject.avatar, k_s=0.0))
         matt = replace(subject, path=dark, avatar=load_avatar(dark))
-        small = [one.scaled(size) for one in (subject, matt)]
+        small = [one.resize(size) for one in (subject, matt)]
         relit = _relight_sections(relight_cases(small[0], light, small[1]), size, voxel)
     text = _page(relit, _fit_section(), _import_table(), size)
     path = folder / "plan.md"
