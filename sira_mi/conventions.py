@@ -14,5 +14,8 @@ DOMAIN_UPPER = (2.6, 2.0, 2.0)
 # Rec.709 luminance of linear RGB.
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
+# Face landmarks of a photo or a head; `portrait/landmarks.py` names them.
+LANDMARKS = 468
+
 # Views of every scene of a collection that never enter training: renderings are compared on them.
 HELD_OUT_VIEWS = (3, 6)

@@ -6,7 +6,6 @@ from skimage.metrics import structural_similarity
 
 from sira_mi.conventions import LUMINANCE
 
-NOSE_TIP = 4  # index of the landmark
 FACE_RADIUS = 95.0  # mm around the nose tip
 SHOULDERS = -1.3  # y above which a point belongs to the head, scene units
 F0_OF_STRENGTH = 0.08  # reflectance at normal incidence of specular strength 1

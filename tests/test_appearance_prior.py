@@ -11,12 +11,12 @@ import pytest
 from conftest import SMALL, small_avatar
 
 from sira_mi.avatar import skin_tone
-from sira_mi.avatar.file import LANDMARKS
-from sira_mi.conventions import HELD_OUT_VIEWS, LUMINANCE
+from sira_mi.conventions import HELD_OUT_VIEWS, LANDMARKS, LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope
+from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.scene_shading import shade_scenes
 from sira_mi.training import af_sm
 from sira_mi.training.prior import assemble_prior
@@ -231,7 +231,7 @@ def scene(model, surface_points, true_latents):
     point, view = np.nonzero((way * inputs[2].T[:, None]).sum(axis=2) < -0.1)
     seen = ap.factors(model, true_latents, [v[:, point] for v in inputs], way[point, view].T.astype(np.float32))
     landmarks = np.full((LANDMARKS, 3), np.nan, np.float32)
-    landmarks[list(af_sm.SKIN_LANDMARKS[:7])] = surface_points[:7]
+    landmarks[list(BARE_SKIN[:7])] = surface_points[:7]
     return TrainingScene(
         points=surface_points,
         normals=inputs[2].T,

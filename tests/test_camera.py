@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import a_camera, one_line
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait import (
     Camera,
@@ -13,7 +14,6 @@ from sira_mi.portrait import (
     estimate_camera,
     reprojection_error,
 )
-from sira_mi.portrait.face import LANDMARKS
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112

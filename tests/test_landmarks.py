@@ -12,8 +12,9 @@ from safetensors.numpy import load_file, save_file
 
 from sira_mi.avatar.file import load_avatar, save_avatar
 from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.portrait.face import LANDMARKS, Face
+from sira_mi.portrait.face import Face
 from sira_mi.portrait.head_landmarks import (
     LandmarkCorrection,
     aligned_face,

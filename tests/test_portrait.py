@@ -8,6 +8,7 @@ import skimage.data
 from conftest import a_camera, one_line
 from PIL import Image
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait import (
     PortraitSettings,
@@ -22,9 +23,8 @@ from sira_mi.portrait import (
     select_face,
     srgb_to_linear,
 )
-from sira_mi.portrait.face import LANDMARKS
 from sira_mi.portrait.mask import guided_filter
-from sira_mi.portrait.portrait import Portrait, area_resample, halved
+from sira_mi.portrait.portrait import Portrait, area_resample, halve
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112
@@ -203,7 +203,7 @@ def test_half_a_portrait_shows_the_same():
     mask = np.ones((7, 6), np.float32)
     mask[0, 5] = 0
     image = rng.uniform(size=(7, 6, 3)).astype(np.float32)
-    half = halved(Portrait(image, mask, camera.project(points), camera.project(points), camera, ()))
+    half = halve(Portrait(image, mask, camera.project(points), camera.project(points), camera, ()))
     assert half.image.shape == (3, 3, 3) and half.image.mean() == pytest.approx(image.mean(), rel=1e-5)
     assert half.mask[0, 2] == 0 and half.mask.sum() == 8
     assert np.allclose(half.camera.project(points), half.landmarks) and np.allclose(half.landmarks, half.head_landmarks)

@@ -15,6 +15,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.fields.encoding import encoded_size
 from sira_mi.fields.mlp import Architecture, layers
@@ -22,7 +23,6 @@ from sira_mi.fields.sdf import SdfField
 from sira_mi.files import write_through
 
 FORMAT = "sira-mi avatar 1"
-LANDMARKS = 468
 PRIOR = Path(__file__).with_name("prior.safetensors")
 _MAXIMUM_BYTES = 64 << 20
 _MAXIMUM_LOBES = 4096

@@ -8,8 +8,6 @@ from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.sdf import in_three
 from sira_mi.optimisation import losses
 
-# Landmarks on bare facial skin: upper cheeks, bridge of the nose, forehead between the brows.
-SKIN_LANDMARKS = (50, 280, 101, 330, 117, 346, 118, 347, 6, 197, 9, 151)
 # Measured facial skin in log linear RGB. The patches "light skin" and "dark skin" of the ColorChecker, made after
 # measured skin (McCamy et al. 1976), sRGB (194, 150, 130) and (115, 82, 68), give its mean and the axis of skin tone;
 # across that axis skin varies as within one population (Yun et al. 2010, a* ± 2.65 and b* ± 2.39).

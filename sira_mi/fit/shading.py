@@ -16,7 +16,7 @@ from sira_mi.fit.geometry import GeometryProblem
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import decoder, photo_points, shade_points
 from sira_mi.optimisation import losses
-from sira_mi.portrait.portrait import Portrait, halved
+from sira_mi.portrait.portrait import Portrait, halve
 
 
 class ShadingProblem(GeometryProblem):
@@ -25,7 +25,7 @@ class ShadingProblem(GeometryProblem):
 
     def __init__(self, portrait: Portrait, avatar: Avatar, avatar_path: str, settings: FitSettings):
         super().__init__(portrait, avatar, avatar_path, settings)
-        self.photo = halved(portrait)
+        self.photo = halve(portrait)
 
     def refresh(self, tensors: dict[str, np.ndarray]) -> None:
         """Finds the photo's points on the current surface too, and what light reaches them. Raises

@@ -19,10 +19,10 @@ from scipy.special import expit, softmax
 from skimage.draw import polygon2mask
 
 from sira_mi.avatar.file import Avatar
-from sira_mi.avatar.skin_tone import SKIN_LANDMARKS, skin_tone_loss, tone_of_luminance
+from sira_mi.avatar.skin_tone import skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.shaded import SeenPoints, base_albedo
-from sira_mi.portrait.landmarks import BELOW_EYES, EYES
+from sira_mi.portrait.landmarks import BARE_SKIN, BELOW_EYES, EYES
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.training.af_sm import AppearanceTraining
 
@@ -94,7 +94,7 @@ class SkinLevel:
 
 def skin_cues(portrait: Portrait) -> SkinCues | None:
     """What a photo tells of its skin; None where no skin is seen."""
-    luminance = _luminance_near(portrait, SKIN_LANDMARKS)
+    luminance = _luminance_near(portrait, BARE_SKIN)
     return SkinCues(float(np.exp(np.log(luminance).mean())), _eyes(portrait)) if len(luminance) else None
 
 
@@ -178,7 +178,7 @@ def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:
     cues = skin_cues(portrait)
     if cues is None or not len(points.row):
         return None
-    landmarks = portrait.landmarks[list(SKIN_LANDMARKS)]
+    landmarks = portrait.landmarks[list(BARE_SKIN)]
     tree = cKDTree(np.stack([points.column, points.row], axis=1) + 0.5)
     distance, nearest = tree.query(landmarks[np.isfinite(landmarks).all(axis=1)])
     close = distance < reach(portrait.landmarks)

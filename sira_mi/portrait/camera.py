@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import BROWS, JAW, MOUTH, OVAL, RIGID
 
@@ -121,9 +121,9 @@ def focal_from_exif(focal_35mm: float, width: int, height: int) -> float:
 def landmark_weights(count: int) -> np.ndarray:
     """How much to trust each landmark for the pose, `[count]`: rigid parts most, what expressions move least.
 
-    Any other number of landmarks than the face mesh's 468 is weighted evenly."""
+    Any other number of landmarks than `LANDMARKS` is weighted evenly."""
     weights = np.ones(count)
-    if count == 468:
+    if count == LANDMARKS:
         weights[:] = 0.3
         for group, weight in ((BROWS, 0.6), (OVAL, 0.25), (JAW, 0.08), (MOUTH, 0.08), (RIGID, 3.0)):
             weights[list(group)] = weight

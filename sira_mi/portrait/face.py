@@ -12,9 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
+from sira_mi.portrait.landmarks import EYE_CORNERS
 
-LANDMARKS = 468
 _SMALL_FACE = 64  # pixels; below this height landmarks get coarse
 _SMALLEST_FACE = 16  # pixels; anything smaller cannot be told from texture
 
@@ -24,7 +25,6 @@ _DETECTOR_SCORE = 0.5
 _PRESENCE = 0.5
 _SURE = 0.95  # a face of less presence may be upside down; if it is, the turned crop shows a surer one
 _SEARCH_SIDE = 2048  # pixels; longest side of the image that the detector searches
-_EYE_CORNERS = (33, 263)  # outer corners, right and left eye of the subject
 _LANDMARK_MARGIN = 1.5  # side of the landmark crop over the size of the face
 _MARGIN_TURN = ((1.5, 0.0), (1.4, -6.0), (1.6, 6.0), (1.4, 6.0), (1.6, -6.0))  # last pass: crop margin, degrees
 
@@ -49,7 +49,7 @@ class Face:
     @property
     def roll(self) -> float:
         """Degrees by which the line between the eyes is turned clockwise, -180 to 180; 0 of an upright face."""
-        return _roll(self.landmarks[list(_EYE_CORNERS)])
+        return _roll(self.landmarks[list(EYE_CORNERS)])
 
 
 @lru_cache(maxsize=4)
@@ -101,7 +101,7 @@ def select_face(faces: list[Face], index: int | None) -> tuple[Face, tuple[str, 
 
 def landmarks_of(image: np.ndarray, face: Face) -> Face:
     """Landmarks measured again around a known face."""
-    corners = face.landmarks[list(_EYE_CORNERS)]
+    corners = face.landmarks[list(EYE_CORNERS)]
     return _refine(image, face.landmarks.min(axis=0), face.landmarks.max(axis=0), corners)
 
 

@@ -17,9 +17,10 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
-from sira_mi.portrait.face import LANDMARKS, Face
+from sira_mi.portrait.face import Face
 from sira_mi.portrait.landmarks import RIGID
 
 CORRECTION = Path(__file__).parent / "models" / "head_landmarks.safetensors"

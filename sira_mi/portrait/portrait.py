@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from sira_mi.conventions import LUMINANCE, MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera, estimate_camera, reprojection_error
-from sira_mi.portrait.face import LANDMARKS, Face, find_faces, select_face
+from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.head_landmarks import head_landmarks
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
 from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, person_mask
@@ -115,7 +115,7 @@ def display_image(image: np.ndarray) -> np.ndarray:
     )
 
 
-def halved(portrait: Portrait) -> Portrait:
+def halve(portrait: Portrait) -> Portrait:
     """The portrait at half its size; a pixel is the person's where all of it is."""
     width, height = (max(1, size // 2) for size in (portrait.camera.width, portrait.camera.height))
     scale = width / portrait.camera.width, height / portrait.camera.height

@@ -12,13 +12,14 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.file import AvatarArchitecture, signed_distance_field
-from sira_mi.avatar.skin_tone import SKIN_LANDMARKS, SKIN_LUMINANCE, skin_tone_loss, tone_of_luminance
+from sira_mi.avatar.skin_tone import SKIN_LUMINANCE, skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, in_three, surface
 from sira_mi.optimisation import losses
+from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.scene_shading import shade_scenes
 from sira_mi.training.scenes import TrainingScene
 
@@ -63,7 +64,7 @@ class FrozenScene:
     specular_level: np.ndarray  # [1, P] of the points' regions
     jittered_x_ref: np.ndarray  # [3, P] at x + ε
     jittered_gamma: np.ndarray  # [N_γ, P]
-    skin_x_ref: np.ndarray  # [3, L] at `SKIN_LANDMARKS`
+    skin_x_ref: np.ndarray  # [3, L] at `BARE_SKIN`
     skin_gamma: np.ndarray  # [N_γ, L]
     skin_weight: np.ndarray  # [1, L] shares of the known landmarks; all 0 where none is known
     skin_radiance: float  # luminance of the skin in the photos, geometric mean; NaN where none is seen
@@ -90,7 +91,7 @@ def freeze_scene(
     moved = x + settings.jitter * rng.standard_normal(x.shape).astype(np.float32)
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
     jittered_x_ref, jittered_gamma = evaluate_in_chunks(lambda p: deform(field, p), moved)
-    landmarks = scene.landmarks[list(SKIN_LANDMARKS)]
+    landmarks = scene.landmarks[list(BARE_SKIN)]
     known = np.isfinite(landmarks).all(axis=1)
     skin_x_ref, skin_gamma = evaluate_in_chunks(lambda p: deform(field, p), np.where(known[:, None], landmarks, 0).T)
     place = np.full(count, -1)

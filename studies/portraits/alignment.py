@@ -10,13 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.landmarks import INNER_EYE_CORNERS, MOUTH_CORNERS, NOSE_BASE, NOSE_TIP
 from sira_mi.training.collection.annotation import Similarity
 from sira_mi.training.collection.registration import similarity
 from studies.portraits.surface_distance import TriangleTree
 
 # The landmarks of H3DS among the 468: inner corners of the right and the left eye, tip and base of the nose, right and
 # left corner of the mouth. The base is the foot of the columella, as the point below it is hidden on some scans.
-SIX_LANDMARKS = (133, 362, 4, 94, 61, 291)
+SIX_LANDMARKS = (*INNER_EYE_CORNERS, NOSE_TIP, NOSE_BASE, *MOUTH_CORNERS)
 _FEWEST_LANDMARKS = 4
 
 

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
+from sira_mi.portrait.landmarks import CHIN
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.build import VARIANT
 from sira_mi.training.collection.render import exposure
@@ -62,7 +63,6 @@ MEAN_LUMINANCE = {"studio": 0.3, "outdoor": 0.3, "extreme": 0.2}
 USUAL_ALBEDO = 0.3
 # Share of the person's pixels that exposure leaves below white in every channel, by light.
 UNCLIPPED = {"studio": 0.995, "outdoor": 0.995, "extreme": 0.97}
-CHIN = 152  # landmark index
 JPEG_QUALITY = 95
 FOCAL_TAG, EXIF_IFD = 0xA405, 0x8769
 

@@ -22,12 +22,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.fit.rays import modelled_pixels
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.collection.skin import EYE, SKIN
-from studies.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statistics
+from studies.measures import FACE_RADIUS, SHOULDERS, statistics
 from studies.portraits.alignment import (
     Icp,
     camera_alignment,
@@ -39,7 +40,7 @@ from studies.portraits.alignment import (
     shared_landmarks,
 )
 from studies.portraits.surface_distance import TriangleTree
-from studies.portraits.truth import LANDMARKS, Truth, check_array, check_mesh
+from studies.portraits.truth import Truth, check_array, check_mesh
 from studies.portraits.visible_surface import (
     MeshImages,
     OuterSurface,

@@ -10,11 +10,11 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from sira_mi.avatar.file import PRIOR, load_avatar
-from sira_mi.avatar.skin_tone import SKIN_LANDMARKS
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.skin import SkinCues, SkinLevel, cue_arrays, near_landmarks, skin_cues
+from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
 from sira_mi.training.collection.skin import SKIN
 from studies.portraits.benchmark import read_benchmark
@@ -73,7 +73,7 @@ def true_luminance(truth: Truth) -> float | None:
     pixels = np.full((len(truth.landmarks), 2), np.nan)
     known = np.isfinite(truth.landmarks).all(axis=1)
     pixels[known] = truth.camera.project(truth.landmarks[known])
-    row, column = near_landmarks(pixels, SKIN_LANDMARKS, (truth.mask > 0.5) & (truth.region == SKIN))
+    row, column = near_landmarks(pixels, BARE_SKIN, (truth.mask > 0.5) & (truth.region == SKIN))
     return float((truth.diffuse_albedo[row, column] @ np.array(LUMINANCE)).mean()) if len(row) else None
 
 

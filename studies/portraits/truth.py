@@ -6,10 +6,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera
 
-LANDMARKS = 468
 _IMAGES = {
     "image": 3,
     "mask": 1,

@@ -19,6 +19,7 @@ import numpy as np
 from sira_mi.avatar.file import AvatarArchitecture
 from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
 from sira_mi.optimisation import losses
+from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.loop import trained_parameters
 from sira_mi.training.scenes import TrainingScene, load_training_scenes
 from sira_mi.training.shape_model import ShapeModel
@@ -134,7 +135,7 @@ def training_scenes(collection: Path) -> list[TrainingScene]:
 
 def mean_nose(collection: Path) -> np.ndarray:
     """The nose tip [3] of the training scenes, on average."""
-    return np.nanmean(shape_prior.load_landmarks(collection)[:, shape_prior.NOSE_TIP], axis=0)
+    return np.nanmean(shape_prior.load_landmarks(collection)[:, NOSE_TIP], axis=0)
 
 
 def seconds(run: Path, model: str = "shape") -> float:

@@ -27,6 +27,7 @@ from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.optimisation.adam import adam, parameter_values
+from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.sg.shading import shade
 from sira_mi.training import af_sm
@@ -35,7 +36,6 @@ from sira_mi.training.scenes import TrainingScene
 from studies.measures import (
     F0_OF_STRENGTH,
     FACE_RADIUS,
-    NOSE_TIP,
     channel_scaled,
     leakage,
     luminance,

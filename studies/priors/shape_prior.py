@@ -26,10 +26,11 @@ from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface
 from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, signed_distance, surface
 from sira_mi.optimisation import losses
 from sira_mi.optimisation.adam import adam
+from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.pictures import blank_tile, extracted_surface, head_tile
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.shape_model import ShapeModel
-from studies.measures import FACE_RADIUS, NOSE_TIP, SHOULDERS, statistics
+from studies.measures import FACE_RADIUS, SHOULDERS, statistics
 
 DISC_RADIUS = 3.0  # mm: a scan is a disc of this radius at every point, across its normal
 VOXEL = 0.05  # of extracted meshes, scene units

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from tqdm import tqdm
 
-from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError, run_command
 from sira_mi.training.collection.annotation import AnnotationSettings, closest_on_surface, consensus, mark_views
-from sira_mi.training.collection.landmarks import COUNT
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.skin import rest_surface
 from sira_mi.training.collection.surface import head_topology
@@ -66,7 +65,7 @@ def main() -> None:
         raise InputError(f"only {len(marks)} faces were found on the pictures")
     middle, number, spread = consensus(np.array(marks))
     valid = number >= FEWEST_MARKS
-    if len(middle) != COUNT or not valid.any():
+    if len(middle) != LANDMARKS or not valid.any():
         raise InputError("the landmark network returned no usable marks")
     middle[valid] = symmetrise(middle[valid])
     vertices, weights = attach(np.where(valid[:, None], middle, 0))

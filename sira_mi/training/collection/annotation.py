@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sira_mi.conventions import MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.portrait.face import Face, find_faces, landmarks_of
-from sira_mi.training.collection.landmarks import COUNT, mesh_landmarks
+from sira_mi.training.collection.landmarks import mesh_landmarks
 from sira_mi.training.collection.makehuman import ANCESTRIES, Identity, identity_vertices
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.render import (
@@ -193,7 +193,7 @@ def mark_views(parts: list[Part], settings: AnnotationSettings) -> Marks:
                 points[~_turned_to(pose, settings.expected_cosine)] = np.nan
             rows.append((points, *hit))
     if not rows:
-        return Marks(np.zeros((0, COUNT, 3)), *(np.zeros((0, COUNT), int),) * 2, np.zeros((0, COUNT, 3)))
+        return Marks(np.zeros((0, LANDMARKS, 3)), *(np.zeros((0, LANDMARKS), int),) * 2, np.zeros((0, LANDMARKS, 3)))
     return Marks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -239,7 +239,7 @@ def _face(image, intrinsic, pose, settings):
     landmarks, valid = mean_head()
     expected = project(landmarks, intrinsic, pose)[0]
     expected[~valid] = expected[valid].mean(0)
-    face = Face(expected, np.zeros(COUNT), 1.0)
+    face = Face(expected, np.zeros(LANDMARKS), 1.0)
     for _ in range(2):
         face = landmarks_of(image, face)
     return face if face.presence >= settings.presence else None
@@ -345,7 +345,7 @@ def find_face(parts: list[Part], turns: Iterator[np.ndarray] | list[np.ndarray])
         for face in find_faces(shown[0])[:1]:
             points, *_ = _trace(scene, placed, face.landmarks, intrinsic[0], pose[0], settings.smallest_cosine)
             seen = target_valid & np.isfinite(points[:, 0])
-            if seen.sum() < COUNT // 3:
+            if seen.sum() < LANDMARKS // 3:
                 continue
             second = align(points[seen], target[seen], scaled=True)
             if misfit(second(points[seen]), target[seen]) < LARGEST_MISFIT:
@@ -382,8 +382,8 @@ def place(
         placed = frame.moved(parts)
         landmarks, valid, spread = annotate(placed, settings)
         both = valid & target_valid
-        if both.sum() < COUNT // 3:
-            raise BrokenHead(f"only {both.sum()} of {COUNT} face landmarks can be seen")
+        if both.sum() < LANDMARKS // 3:
+            raise BrokenHead(f"only {both.sum()} of {LANDMARKS} face landmarks can be seen")
         free = align(landmarks[both], target[both], scaled=True)
         if misfit(free(landmarks[both]), target[both]) > LARGEST_MISFIT:
             raise BrokenHead("what the landmark network marked is no face")

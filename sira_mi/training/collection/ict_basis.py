@@ -9,8 +9,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.portrait.face import LANDMARKS, find_faces
+from sira_mi.portrait.face import find_faces
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.lighting import lobe_map
 from sira_mi.training.collection.registration import Places, fit_sphere, nearest

@@ -5,7 +5,7 @@ from importlib import resources
 
 import numpy as np
 
-COUNT = 468
+from sira_mi.conventions import LANDMARKS
 
 
 @cache
@@ -22,6 +22,6 @@ def mesh_landmarks(head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Landmarks [468, 3] and validity [468] on head vertices [M, 3]."""
     stored = landmark_barycentrics()
     if stored is None:
-        return np.zeros((COUNT, 3)), np.zeros(COUNT, bool)
+        return np.zeros((LANDMARKS, 3)), np.zeros(LANDMARKS, bool)
     vertices, weights, valid = stored
     return np.einsum("nk,nkd->nd", weights, head[vertices]), valid

@@ -1,6 +1,8 @@
 """What a textured head is made of: skin, hair, eyes and cloth told apart by place and colour, and the parts of a scene
 that follow."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
@@ -8,6 +10,7 @@ from skimage.color import rgb2lab
 from skimage.measure import points_in_poly
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
+from sira_mi.portrait.landmarks import CHEEKS, CHIN, LIP_BORDER, NOSE_UNDERSIDE, OVAL
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.annotation import mean_head
@@ -15,12 +18,7 @@ from sira_mi.training.collection.render import Part
 from sira_mi.training.collection.textured_surface import Surface, place_index, smooth_normals
 
 FACE_EDGE, HEAD_EDGE, BODY_EDGE = 0.03, 0.045, 0.07  # scene units, longest edge on the face, the head and below
-# Landmark indices.
-CHIN, NOSE_TIP = 152, 1
-CHEEKS = [50, 280, 205, 425, 101, 330, 151, 36, 266]
-LIPS = [61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 409, 270, 269, 267, 0, 37, 39, 40, 185, 13, 14, 82, 312]
-OVAL = [10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152, 148, 176, 149]
-OVAL += [150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109]
+_LIP_MIDDLES = (13, 14, 82, 312)
 LIGHTNESS_WEIGHT = 0.6  # of L* beside a* and b* where colours are told apart
 BALD = 12.0  # colour distance between crown and cheeks below which no hair is painted on the scalp
 SPECULAR = {skin.HAIR: 0.3, skin.CLOTH: 0.1, skin.EYE: 0.9}
@@ -35,7 +33,7 @@ def head_edges(middle: np.ndarray) -> np.ndarray:
 
 def face_mask(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     """Whether points [N, 3] belong to the face: in front, inside the oval of the landmarks [468, 3] seen from there."""
-    oval = landmarks[OVAL]
+    oval = landmarks[list(OVAL)]
     return (points[:, 2] > oval[:, 2].min() - 0.1) & points_in_poly(points[:, :2], oval[:, :2])
 
 
@@ -85,11 +83,11 @@ def classify(vertices: np.ndarray, triangles: np.ndarray, albedo: np.ndarray, la
     return np.array([skin.SKIN, skin.HAIR, skin.CLOTH])[places[index].argmax(1)]
 
 
-def near_landmarks(vertices: np.ndarray, landmarks: np.ndarray, chosen: list[int], radius: float) -> np.ndarray:
+def near_landmarks(vertices: np.ndarray, landmarks: np.ndarray, chosen: Sequence[int], radius: float) -> np.ndarray:
     """Indices of the vertices within a radius of the chosen landmarks, at least the nearest one of each."""
-    tree = cKDTree(landmarks[chosen])
+    tree = cKDTree(landmarks[list(chosen)])
     inside = np.flatnonzero(tree.query(vertices, distance_upper_bound=radius)[0] < radius)
-    return np.union1d(inside, cKDTree(vertices).query(landmarks[chosen])[1])
+    return np.union1d(inside, cKDTree(vertices).query(landmarks[list(chosen)])[1])
 
 
 def albedo_scale(vertices: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> float:
@@ -102,9 +100,9 @@ def albedo_scale(vertices: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray
 
 def specular_strength(vertices: np.ndarray, region: np.ndarray, landmarks: np.ndarray, base: float) -> np.ndarray:
     """Specular strength [N]: skin has `base`, more on lips, nose and forehead; hair, cloth and eyes have their own."""
-    distance = cKDTree(landmarks[LIPS]).query(vertices)[0]
+    distance = cKDTree(landmarks[[*LIP_BORDER, *_LIP_MIDDLES]]).query(vertices)[0]
     lips = np.exp(-((distance / 0.06) ** 2))
-    nose = np.exp(-(((vertices - landmarks[NOSE_TIP] - [0, 0.15, 0]) / [0.16, 0.28, 0.35]) ** 2).sum(1))
+    nose = np.exp(-(((vertices - landmarks[NOSE_UNDERSIDE] - [0, 0.15, 0]) / [0.16, 0.28, 0.35]) ** 2).sum(1))
     strength = base + 0.16 * lips + 0.14 * nose
     for code, value in SPECULAR.items():
         strength[region == code] = value

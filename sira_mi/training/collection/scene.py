@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMINANCE
+from sira_mi.portrait.landmarks import NOSE_UNDERSIDE
 from sira_mi.training.collection.lighting import sample_light
 from sira_mi.training.collection.outer import (
     Samples,
@@ -33,8 +34,6 @@ from sira_mi.training.collection.render import (
 )
 from sira_mi.training.collection.skin import CLOTH
 from sira_mi.training.collection.subject import BrokenHead, Subject
-
-NOSE_TIP = 1  # landmark index
 
 LAYOUT = {
     "points": "[P, 3] f4, outer visible surface, scene units",
@@ -107,9 +106,9 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
     random = np.random.default_rng([seed, 2])
     light, light_info = sample_light(random, hdri)
     landmarks, landmarks_valid = subject.landmarks, subject.landmarks_valid
-    if not landmarks_valid[NOSE_TIP]:
+    if not landmarks_valid[NOSE_UNDERSIDE]:
         raise BrokenHead("the nose tip has no landmark")
-    nose = landmarks[NOSE_TIP]
+    nose = landmarks[NOSE_UNDERSIDE]
     scene = build_scene(subject.parts, light, settings.render)
 
     cameras = sample_cameras(random, settings.render.size)

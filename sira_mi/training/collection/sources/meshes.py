@@ -12,10 +12,10 @@ import numpy as np
 import trimesh
 
 from sira_mi.errors import InputError
+from sira_mi.portrait.landmarks import CHIN
 from sira_mi.portrait.load import srgb_to_linear
 from sira_mi.training.collection.annotation import Similarity, axis_turns, find_face, place
 from sira_mi.training.collection.regions import (
-    CHIN,
     albedo_scale,
     classify,
     complete,

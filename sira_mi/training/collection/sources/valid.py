@@ -14,12 +14,12 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from sira_mi.errors import InputError
+from sira_mi.portrait.landmarks import CHIN
 from sira_mi.training.collection import hair as hairs
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.annotation import Similarity, mean_eyes, place
 from sira_mi.training.collection.person import HAIR_SPECULAR, STRAND_RELIEF
 from sira_mi.training.collection.regions import (
-    CHIN,
     albedo_scale,
     classify,
     complete,
