@@ -14,7 +14,7 @@ from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg import multisampling, visibility
-from sira_mi.sg.radiance import diffuse_radiance, physical_radiance
+from sira_mi.sg.radiance import Material, reflected_radiance
 
 # Rows of the columns that are computed at a hit, in order.
 _ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}
@@ -190,16 +190,14 @@ class SiraSG(mi.SamplingIntegrator):
             directions = visibility.light_directions(dr.detach(all_lobes).numpy(), self.directions)
 
         def radiances(x, normal, view, diffuse, specular):
-            is_open = open_directions(scene, head, x, normal, directions) if self.visibility else None
-            arrival = None
-            if not speculars:
-                if self.visibility:
-                    arrival = visibility.diffuse_arrival(normal, all_lobes, directions, is_open)
-                lit = diffuse_radiance(diffuse, normal, lobes, arrival)
-                return lit, dr.zeros(mi.TensorXf, lit.shape)
-            if self.visibility:
-                arrival = visibility.arrival(normal, -view, specular, bsdf.roughness, all_lobes, directions, is_open)
-            return physical_radiance(diffuse, specular, normal, view, bsdf.roughness, k_s, lobes, arrival)
+            material = Material(diffuse, specular if speculars else None, bsdf.roughness, k_s)
+            if not self.visibility:
+                return reflected_radiance(normal, view, material, lobes)
+            unoccluded = unoccluded_directions(scene, head, x, normal, directions)
+            visible = visibility.light_visibility(
+                normal, view, material.specular_albedo, bsdf.roughness, all_lobes, directions, unoccluded
+            )
+            return reflected_radiance(normal, view, material, lobes, visible)
 
         def columns(x, direction):
             _, gradient, x_ref, gamma = surface(field, x)
@@ -290,7 +288,7 @@ def mesh_albedos(head, bsdf, si, x) -> list:
     return result
 
 
-def open_directions(scene, head, x, normal, directions):
+def unoccluded_directions(scene, head, x, normal, directions):
     """Which of `directions`, in the field's coordinates, no surface of the scene blocks at surface points and normals
     [3, N] of the field: tensor [K, N] of 0 and 1, without gradients."""
     rotation = rotation_of(head.to_world)
@@ -298,7 +296,7 @@ def open_directions(scene, head, x, normal, directions):
     offset = visibility.SHADOW_OFFSET * head.voxel * scale_of(head.to_world)
     normal = rotation @ dr.detach(normal).numpy()
     return mi.TensorXf(
-        visibility.trace_open(scene, point, normal, directions.axis @ rotation.T, offset).astype(np.float32)
+        visibility.trace_unoccluded(scene, point, normal, directions.axis @ rotation.T, offset).astype(np.float32)
     )
 
 

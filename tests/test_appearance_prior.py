@@ -13,11 +13,10 @@ from conftest import SMALL, small_avatar
 from sira_mi.avatar import skin_tone
 from sira_mi.conventions import HELD_OUT_VIEWS, LANDMARKS, LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope
 from sira_mi.portrait.landmarks import BARE_SKIN
-from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.sg.radiance import Material, radiance_of_scenes, reflected_radiance
 from sira_mi.training import af_sm
 from sira_mi.training.prior import assemble_prior
 from sira_mi.training.scenes import TrainingScene
@@ -109,27 +108,20 @@ def shaded(lit_points, per_scene: bool):
         for k in range(3):
             mine = slice(7 * k, 7 * k + 7)
             white = mi.TensorXf(np.full((3, 7), np.pi, np.float32))
-            both = af_sm.physical_radiance(
-                white, specular[:, mine], normals[:, mine], views[:, mine], 0.5, 1.0, lobes[:, :, k]
-            )
+            material = Material(white, specular[:, mine], 0.5, 1.0)
+            both = reflected_radiance(normals[:, mine], views[:, mine], material, lobes[:, :, k])
             parts.append(both[0] + 2.0 * both[1])
         radiance = dr.concat(parts, axis=1)
     else:
-        irradiance, glossy = shade_scenes(
-            from_columns(normals, mi.Vector3f),
-            from_columns(-views, mi.Vector3f),
-            from_columns(specular, mi.Float),
-            0.5,
-            lobes,
-            3,
-        )
-        radiance = to_columns(irradiance) + 2.0 * to_columns(glossy)
+        white = mi.TensorXf(np.full((3, 21), np.pi, np.float32))
+        both = radiance_of_scenes(normals, views, Material(white, specular, 0.5, 1.0), lobes, 3)
+        radiance = both.diffuse + 2.0 * both.specular
     dr.backward(dr.sum(radiance * mi.TensorXf(random(3, 21, seed=8)), axis=None))
     return radiance.numpy(), dr.grad(specular).numpy(), dr.grad(lobes).numpy()
 
 
 def test_scenes_shaded_together_are_those_shaded_alone(lit_points):
-    """`sg.shading.shade`, scene by scene, is the reference, gradients included."""
+    """`reflected_radiance`, scene by scene, is the reference, gradients included."""
     for together, alone in zip(shaded(lit_points, False), shaded(lit_points, True), strict=True):
         assert np.abs(alone).max() > 0.01
         np.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-4 * np.abs(alone).max())

@@ -238,7 +238,7 @@ def test_late_bounces_add_less_than_their_bound(mean_head):
 
 
 def test_without_a_specular_term_nothing_of_it_is_computed(avatar, tmp_path):
-    """k_s = 0: the plan leaves the specular term out; the closed form does not change, path tracing only by its noise."""
+    """k_s = 0: the plan leaves the specular term out; the closed form stays the same, path tracing within its noise."""
     save_avatar(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0))
     matt = Subject(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0), camera(40.0, SIZE))
     light = Light(LOBES)

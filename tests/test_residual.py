@@ -94,7 +94,7 @@ def test_the_light_is_uncertain_where_it_grazes_and_where_shadows_end(variant):
     chosen = np.arange(0, 6000, 2)
 
     def grey_light(p):
-        return np.repeat((np.maximum(p.normal[2], 0) * p.is_open[0] + 0.05)[None], 3, axis=0)
+        return np.repeat((np.maximum(p.normal[2], 0) * p.unoccluded[0] + 0.05)[None], 3, axis=0)
 
     def two_colours(p):
         return np.stack([np.maximum(p.normal[0], 0), np.maximum(-p.normal[0], 0), 0 * p.normal[0]]) + 0.3

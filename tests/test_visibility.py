@@ -42,7 +42,7 @@ def ball():
     return mi.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, HEIGHT], "radius": RADIUS}})
 
 
-def open_past_the_ball(x, directions):
+def unoccluded_by_the_ball(x, directions):
     """Bool [K, N]: the ball covers a cap of known width around its centre's direction."""
     offset = np.array([[0], [0], [HEIGHT]]) - x
     distance = np.linalg.norm(offset, axis=0)
@@ -71,20 +71,21 @@ def reference(x, normal, outgoing, specular, lobes, count=6000):
     fresnel = specular + (1 - specular) * 2 ** ((-5.55473 * half / 2 - 6.8316) * half / 2)
     glossy = np.exp(2 / ROUGHNESS**4 * np.minimum((cosine + view) / half - 1, 0)) * fresnel * cosine
     glossy /= cosine * (1 - k) + k
-    is_open = open_past_the_ball(x, direction)
-    return tuple((light @ (f * is_open)) / (light @ f) for f in (cosine, glossy))
+    unoccluded = unoccluded_by_the_ball(x, direction)
+    return tuple((light @ (f * unoccluded)) / (light @ f) for f in (cosine, glossy))
 
 
-def arriving(inputs, lobes, directions, is_open):
+def visible(inputs, lobes, directions, unoccluded):
     normal, outgoing, specular = map(tensor, inputs)
-    return visibility.arrival(normal, outgoing, specular, ROUGHNESS, tensor(lobes), directions, tensor(is_open))
+    light = tensor(lobes)
+    return visibility.light_visibility(normal, -outgoing, specular, ROUGHNESS, light, directions, tensor(unoccluded))
 
 
 def test_traced_directions_are_those_beside_the_ball():
     x, normal, _, _ = points()
     directions = fibonacci_directions(500)
-    found = visibility.trace_open(ball(), x, normal, directions, 1e-3)
-    expected = open_past_the_ball(x, directions) | (directions @ normal <= 0)
+    found = visibility.trace_unoccluded(ball(), x, normal, directions, 1e-3)
+    expected = unoccluded_by_the_ball(x, directions) | (directions @ normal <= 0)
     assert found.shape == (500, 60) and (found != expected).mean() < 2e-3 and (~found).mean() > 0.02
 
 
@@ -118,7 +119,7 @@ def test_shares_against_quadrature(lobes, kind, count, tolerance):
     x, *inputs = points()
     make = visibility.even_directions if kind == "even" else lambda n: visibility.light_directions(lobes, n)
     directions = make(count)
-    found = arriving(inputs, lobes, directions, visibility.trace_open(ball(), x, inputs[0], directions.axis, 1e-3))
+    found = visible(inputs, lobes, directions, visibility.trace_unoccluded(ball(), x, inputs[0], directions.axis, 1e-3))
     expected = reference(x, *inputs, lobes)
     for share, truth, slack in zip((found.diffuse, found.specular), expected, (1, 2.5), strict=True):
         error = np.sqrt(((share.numpy() - truth) ** 2).mean())
@@ -128,21 +129,21 @@ def test_shares_against_quadrature(lobes, kind, count, tolerance):
 
 @pytest.mark.parametrize("lobes", [SOFT, SUN, 0 * SOFT + [0, 0, 1, 5, 0, 0, 0], np.array([[0, 0, -1, 1e5, 1, 1, 1.0]])])
 def test_limits(lobes):
-    """All open: all arrives and nothing bounces. All blocked: nothing arrives. Black lights and lights below the
+    """Nothing blocked: all of the light and no bounce. All blocked: no light. Black lights and lights below the
     horizon stay finite."""
     _, *inputs = points()
     directions = visibility.light_directions(lobes, 64)
-    clear = arriving(inputs, lobes, directions, np.ones((64, 60)))
-    shut = arriving(inputs, lobes, directions, np.zeros((64, 60)))
+    clear = visible(inputs, lobes, directions, np.ones((64, 60)))
+    shut = visible(inputs, lobes, directions, np.zeros((64, 60)))
     for share in (clear.diffuse, clear.specular):
         np.testing.assert_allclose(share.numpy(), 1, atol=1e-5)
-    bounced = [a.numpy() for a in (clear.bounced_diffuse, clear.bounced_specular)]
+    bounced = [a.numpy() for a in (clear.bounce_diffuse, clear.bounce_specular)]
     assert all((a == 0).all() for a in bounced)
-    for name in ("diffuse", "specular", "bounced_diffuse", "bounced_specular"):
+    for name in ("diffuse", "specular", "bounce_diffuse", "bounce_specular"):
         values = getattr(shut, name).numpy()
         assert np.isfinite(values).all() and (values >= 0).all() and values.shape == (3, 60)
     if lobes is SOFT:
-        assert shut.diffuse.numpy().max() < 2e-3 and shut.bounced_diffuse.numpy().min() > 0
+        assert shut.diffuse.numpy().max() < 2e-3 and shut.bounce_diffuse.numpy().min() > 0
 
 
 def test_bounced_light_against_the_sum_over_pairs_of_directions():
@@ -150,10 +151,10 @@ def test_bounced_light_against_the_sum_over_pairs_of_directions():
     expansion to first order, cut at 0, is rounder: up to 1.6 times as much here, at the same places."""
     x, *inputs = points()
     directions = visibility.even_directions(256)
-    is_open = open_past_the_ball(x, directions.axis)
-    found = arriving(inputs, SOFT, directions, is_open).bounced_diffuse.numpy()
+    unoccluded = unoccluded_by_the_ball(x, directions.axis)
+    found = visible(inputs, SOFT, directions, unoccluded).bounce_diffuse.numpy()
     axis, weight, normal = directions.axis, directions.weight[:, None], inputs[0]
-    blocked = weight * np.maximum(axis @ normal, 0) * ~is_open
+    blocked = weight * np.maximum(axis @ normal, 0) * ~unoccluded
     received = np.maximum(-axis @ axis.T, 0) @ blocked * np.minimum(1 + axis @ normal, 1)
     expected = (evaluate_lobes(SOFT, axis) * weight).T @ received / np.pi
     assert 1.0 < found.sum() / expected.sum() < 1.6
@@ -162,7 +163,7 @@ def test_bounced_light_against_the_sum_over_pairs_of_directions():
 
 def weighted(found):
     rng = np.random.default_rng(7)
-    parts = (found.diffuse, found.specular, found.bounced_diffuse, found.bounced_specular)
+    parts = (found.diffuse, found.specular, found.bounce_diffuse, found.bounce_specular)
     return sum((dr.sum(part * tensor(rng.uniform(0, 1, (3, 60))), axis=None) for part in parts), mi.TensorXf(0.0))
 
 
@@ -170,13 +171,13 @@ def weighted(found):
 def test_derivatives_against_differences(which):
     x, normal, outgoing, specular = points()
     directions = visibility.even_directions(128)
-    is_open = tensor(open_past_the_ball(x, directions.axis))
+    unoccluded = tensor(unoccluded_by_the_ball(x, directions.axis))
     start = {"normal": normal, "specular": specular, "roughness": np.array([0.6]), "lobes": SOFT}
 
     def loss(values):
         rough = mi.Float(values["roughness"].array)
-        arguments = values["normal"], tensor(outgoing), values["specular"], rough, values["lobes"]
-        return weighted(visibility.arrival(*arguments, directions, is_open))
+        arguments = values["normal"], tensor(-outgoing), values["specular"], rough, values["lobes"]
+        return weighted(visibility.light_visibility(*arguments, directions, unoccluded))
 
     values = {name: tensor(value) for name, value in start.items()}
     dr.enable_grad(values[which])
@@ -191,12 +192,14 @@ def test_derivatives_against_differences(which):
 def test_derivatives_repeat_bit_for_bit():
     x, *inputs = points()
     directions = visibility.even_directions(128)
-    is_open = open_past_the_ball(x, directions.axis)
+    unoccluded = unoccluded_by_the_ball(x, directions.axis)
 
     def run():
         values = [*map(tensor, inputs), tensor(SOFT)]
         dr.enable_grad(values)
-        dr.backward(weighted(visibility.arrival(*values[:3], 0.5, values[3], directions, tensor(is_open))))
+        normal, outgoing, specular, lobes = values
+        found = visibility.light_visibility(normal, -outgoing, specular, 0.5, lobes, directions, tensor(unoccluded))
+        dr.backward(weighted(found))
         return [dr.grad(value).numpy() for value in values]
 
     first = run()

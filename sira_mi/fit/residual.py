@@ -72,8 +72,8 @@ def light_variances(
     for _ in range(_TRIALS):
         shifted = place[chosen] + _SHIFT / np.sqrt(3) * rng.standard_normal((len(chosen), 3))
         _, other = everywhere.query(shifted)
-        is_open = np.ascontiguousarray(points.is_open[:, other])
-        wrong = replace(at, normal=_tilted(at.normal, rng), is_open=is_open)
+        unoccluded = np.ascontiguousarray(points.unoccluded[:, other])
+        wrong = replace(at, normal=_tilted(at.normal, rng), unoccluded=unoccluded)
         total += squares(log_residual(radiance(wrong), expected))
     _, near = cKDTree(place[chosen]).query(place, k=min(_NEIGHBOURS, len(chosen)))
     mean = (total / _TRIALS)[:, near.reshape(len(place), -1)].mean(axis=2)

@@ -16,8 +16,8 @@ from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.sg.radiance import diffuse_radiance, physical_radiance
-from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, diffuse_arrival, even_directions, trace_open
+from sira_mi.sg.radiance import Material, reflected_radiance
+from sira_mi.sg.visibility import SHADOW_OFFSET, even_directions, light_visibility, trace_unoccluded
 
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
@@ -44,7 +44,7 @@ class SeenPoints:
 class PhotoPoints(SeenPoints):
     """Those inside a photo's mask."""
 
-    is_open: np.ndarray  # [K, N] bool: whether light arrives from each of `even_directions(DIRECTIONS)`
+    unoccluded: np.ndarray  # [K, N] bool: whether nothing blocks each of `even_directions(DIRECTIONS)`
 
 
 def seen_points(camera: Camera, head) -> SeenPoints:
@@ -70,11 +70,13 @@ def photo_points(portrait: Portrait, head, shadows: bool = True) -> PhotoPoints:
     seen = seen_points(portrait.camera, head)
     seen = seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
     if not shadows:
-        return PhotoPoints(**vars(seen), is_open=np.ones((DIRECTIONS, len(seen.row)), bool))
+        return PhotoPoints(**vars(seen), unoccluded=np.ones((DIRECTIONS, len(seen.row)), bool))
     scene = mi.load_dict({"type": "scene", "head": head})
     place = seen.origin + seen.t * seen.view
-    is_open = trace_open(scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel)
-    return PhotoPoints(**vars(seen), is_open=is_open)
+    unoccluded = trace_unoccluded(
+        scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel
+    )
+    return PhotoPoints(**vars(seen), unoccluded=unoccluded)
 
 
 def decoder(avatar: Avatar, name: str, tensors: dict, latent: str | None = None) -> list[tuple]:
@@ -100,22 +102,19 @@ class Shading:
 
 def shade_points(avatar: Avatar, tensors: dict, k_s: float | None, points: PhotoPoints, albedo, normal=None) -> Shading:
     """Light and radiance at `points` of diffuse `albedo` [3, N] by the decoders at `tensors` (Floats); `normal` [3, N],
-    a tensor, may stand in for the points' own. Light counts where it arrives, as in the `sira_sg` integrator. With
-    `k_s` None the specular part is left out, which is 0 then."""
-    octaves = avatar.architecture.specular_octaves
+    a tensor, may stand in for the points' own. Shadows are those of the `sira_sg` integrator. With `k_s` None the
+    specular term is left out, and 0."""
     view = mi.TensorXf(points.view)
     normal = mi.TensorXf(points.normal) if normal is None else normal
     lobes = decode_lobes(avatar, tensors)
-    is_open = mi.TensorXf(points.is_open.astype(np.float32))
-    directions = even_directions(DIRECTIONS)
-    if k_s is None:
-        diffuse = diffuse_radiance(albedo, normal, lobes, diffuse_arrival(normal, lobes, directions, is_open))
-        return Shading(lobes, diffuse, dr.zeros(mi.TensorXf, diffuse.shape))
-    network = decoder(avatar, "specular_albedo", tensors, "z_s")
-    specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
-    arrives = arrival(normal, -view, specular, mi.Float(avatar.roughness), lobes, directions, is_open)
-    radiance = physical_radiance(albedo, specular, normal, view, avatar.roughness, k_s, lobes, arrives)
-    return Shading(lobes, *radiance)
+    specular = None
+    if k_s is not None:
+        network, octaves = decoder(avatar, "specular_albedo", tensors, "z_s"), avatar.architecture.specular_octaves
+        specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
+    unoccluded, directions = mi.TensorXf(points.unoccluded.astype(np.float32)), even_directions(DIRECTIONS)
+    visibility = light_visibility(normal, view, specular, avatar.roughness, lobes, directions, unoccluded)
+    material = Material(albedo, specular, avatar.roughness, 0.0 if k_s is None else k_s)
+    return Shading(lobes, *reflected_radiance(normal, view, material, lobes, visibility))
 
 
 def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):

@@ -14,8 +14,15 @@ from scipy.spatial import cKDTree
 from sira_mi.fields.columns import from_columns
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, surface
 from sira_mi.sg.multisampling import COSINE
-from sira_mi.sg.radiance import physical_radiance
-from sira_mi.sg.visibility import SHADOW_OFFSET, arrival, even_directions, light_directions, trace_open
+from sira_mi.sg.radiance import Material, reflected_radiance
+from sira_mi.sg.visibility import (
+    SHADOW_OFFSET,
+    Visibility,
+    even_directions,
+    light_directions,
+    light_visibility,
+    trace_unoccluded,
+)
 
 _POINTS = 4096
 _DIRECTIONS = 64
@@ -95,16 +102,17 @@ def _tensor(array):
     return mi.TensorXf(np.ascontiguousarray(array, np.float32))
 
 
-def _radiance(points: Surface, view, roughness, k_s, lobes, arrives=None) -> np.ndarray:
-    columns = [_tensor(v) for v in (points.albedo, points.specular, points.normal, view)]
-    return sum(v.numpy() for v in physical_radiance(*columns, roughness, k_s, _tensor(lobes), arrives))
+def _radiance(points: Surface, view, roughness, k_s, lobes, visibility: Visibility | None = None) -> np.ndarray:
+    material = Material(_tensor(points.albedo), _tensor(points.specular), roughness, k_s)
+    radiance = reflected_radiance(_tensor(points.normal), _tensor(view), material, _tensor(lobes), visibility)
+    return radiance.diffuse.numpy() + radiance.specular.numpy()
 
 
 def bounced_radiance(
     points: Surface, lobes: np.ndarray | None, roughness: float, k_s: float, reflectance: float
 ) -> list[np.ndarray]:
     """Radiance [N], strongest channel, that each point reflects of light which was reflected n = 1, 2, … times before,
-    from above: light arrives unshadowed at the first surface, and `reflectance` of the brightest neighbour is reflected
+    from above: nothing shadows the first surface, and `reflectance` of the brightest neighbour is reflected
     specularly. `lobes` None: every surface has a radiance of 1 at first. The last entry is all that remains."""
     blocked = points.neighbour >= 0
     directions = even_directions(_DIRECTIONS)
@@ -138,8 +146,8 @@ def shadow_error(
     if points.point.shape[1] == 0:
         return 0.0
     view = _view(points, centre)
-    arrives = _arrival(shape, points, view, lobes, roughness, directions)
-    with_shadows, without = (_radiance(points, view, roughness, k_s, lobes, a) for a in (arrives, None))
+    visibility = _visibility(shape, points, view, lobes, roughness, directions)
+    with_shadows, without = (_radiance(points, view, roughness, k_s, lobes, v) for v in (visibility, None))
     return float(np.abs(with_shadows - without).max())
 
 
@@ -149,12 +157,12 @@ def _view(points: Surface, centre: np.ndarray) -> np.ndarray:
     return view / np.linalg.norm(view, axis=0)
 
 
-def _arrival(shape, points: Surface, view, lobes, roughness, directions: int):
+def _visibility(shape, points: Surface, view, lobes, roughness, directions: int) -> Visibility:
     chosen = light_directions(lobes, directions)
     scene = mi.load_dict({"type": "scene", "head": shape})
-    is_open = trace_open(scene, points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
-    inputs = [_tensor(v) for v in (points.normal, -view, points.specular)]
-    return arrival(*inputs, mi.Float(roughness), _tensor(lobes), chosen, _tensor(is_open))
+    unoccluded = trace_unoccluded(scene, points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
+    inputs = [_tensor(v) for v in (points.normal, view, points.specular)]
+    return light_visibility(*inputs, roughness, _tensor(lobes), chosen, _tensor(unoccluded))
 
 
 def sharing_error(
@@ -173,8 +181,8 @@ def sharing_error(
     used &= (view * normal).sum(axis=0)[middle] < 0
     if not used.any():
         return 0.0
-    arrives = _arrival(shape, everything, view, lobes, roughness, directions)
-    radiance = _radiance(everything, view, roughness, k_s, lobes, arrives)
+    visibility = _visibility(shape, everything, view, lobes, roughness, directions)
+    radiance = _radiance(everything, view, roughness, k_s, lobes, visibility)
     change = np.abs(radiance[:, corner] - radiance[:, middle]).max(axis=0)
     distance = np.linalg.norm(points[:, corner] - points[:, middle], axis=0)
     return reach * float((change / np.maximum(distance, 1e-6))[used].max())

@@ -40,7 +40,7 @@ def fresnel(specular_albedo: "mi.Float", cosine: "mi.Float") -> "mi.Float":
     return dr.lerp(fresnel_weight(cosine), 1.0, specular_albedo)
 
 
-def visibility(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
+def masking(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
     """g(c)/c = 1 / (c(1 − k) + k) with k = (r + 1)²/8; the G of one direction over its cosine."""
     k = dr.square(roughness + 1.0) / 8.0
     return dr.rcp(dr.fma(cosine, 1.0 - k, k))
@@ -58,8 +58,8 @@ def specular_brdf(
     above = (cos_view > 0.0) & (cos_light > 0.0)
     half = dr.normalize(dr.select(above, view + light, normal))
     density = distribution(0.5 * dr.squared_norm(half - normal), roughness)
-    masking = visibility(dr.maximum(cos_view, 0.0), roughness) * visibility(dr.maximum(cos_light, 0.0), roughness)
-    value = 0.25 * density * masking * fresnel(specular_albedo, dr.dot(view, half))
+    both = masking(dr.maximum(cos_view, 0.0), roughness) * masking(dr.maximum(cos_light, 0.0), roughness)
+    value = 0.25 * density * both * fresnel(specular_albedo, dr.dot(view, half))
     return dr.select(above, value, 0.0)
 
 

@@ -1,37 +1,84 @@
-"""Eq. 8 on columns of surface points: diffuse and specular radiance of albedos, normals and views under lobes."""
+"""Eq. 8: the diffuse and specular radiance that surface points reflect of a light of spherical Gaussians.
 
+Points are tensors `[3, N]`, one column a point: unit normals and unit views, which run from the camera to the point.
+"""
+
+from typing import NamedTuple
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import from_columns, to_columns
-from sira_mi.sg.shading import irradiance as irradiance_of
+from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.sg.shading import irradiance as closed_form_irradiance
 from sira_mi.sg.shading import shade
-from sira_mi.sg.visibility import received
+from sira_mi.sg.visibility import Visibility
 
 
-def physical_radiance(albedo, specular, normals, views, roughness, k_s, lobes, arrival=None):
-    """Eq. 8 in closed form: diffuse and specular radiance [3, N] of surface points under `lobes` [N_l, 7], with shadows
-    and a bounce off surfaces of the same albedo if `arrival` (of `sg.visibility`) is given.
+class Material(NamedTuple):
+    """What eq. 8 needs of the surface at N points."""
 
-    `albedo` [3, N], `specular` [1, N], `roughness` and `k_s` numbers or [1, 1], unit `normals` [3, N], `views` [3, N]
-    from the camera to the point. Where a normal faces away from the camera there is no specular radiance."""
-    irradiance, specular_radiance = shade(
+    diffuse_albedo: "mi.TensorXf"  # [3, N]
+    specular_albedo: "mi.TensorXf | None"  # [1, N] reflectance at normal incidence; None leaves the specular term out
+    roughness: "mi.Float | float"
+    k_s: "mi.TensorXf | float"  # weight of the specular term; a number or [1, 1]
+
+
+class Radiance(NamedTuple):
+    """Radiance [3, N] by the two terms of eq. 8."""
+
+    diffuse: "mi.TensorXf"
+    specular: "mi.TensorXf"
+
+
+def reflect(
+    material: Material,
+    irradiance: "mi.TensorXf",
+    specular: "mi.TensorXf | None",
+    visibility: Visibility | None = None,
+) -> Radiance:
+    """Eq. 8, a/π E + k_s ∫ l f^s (n·ω)₊ dω, of the two integrals [3, N] of the unoccluded light. With `visibility` they
+    are reduced to what reaches the points, and one bounce is added, off occluders of the points' own albedo."""
+    albedo = material.diffuse_albedo
+    if visibility is not None:
+        irradiance = irradiance * visibility.diffuse + visibility.bounce_diffuse * albedo
+        if specular is not None:
+            specular = specular * visibility.specular + visibility.bounce_specular * albedo
+    diffuse = albedo * irradiance * (1 / np.pi)
+    return Radiance(diffuse, dr.zeros(mi.TensorXf, diffuse.shape) if specular is None else specular * material.k_s)
+
+
+def reflected_radiance(
+    normals: "mi.TensorXf",
+    views: "mi.TensorXf",
+    material: Material,
+    lobes: "mi.TensorXf",
+    visibility: Visibility | None = None,
+) -> Radiance:
+    """Eq. 8 in closed form at points under the light `lobes` [N_l, 7]; without `visibility` nothing blocks it. A normal
+    that faces away from the camera has no specular radiance. Differentiable in every argument."""
+    if material.specular_albedo is None:
+        irradiance = to_columns(closed_form_irradiance(from_columns(normals, mi.Vector3f), lobes))
+        return reflect(material, irradiance, None, visibility)
+    parts = shade(*_shading_points(normals, views, material), mi.Float(material.roughness), lobes)
+    return reflect(material, *map(to_columns, parts), visibility)
+
+
+def radiance_of_scenes(
+    normals: "mi.TensorXf", views: "mi.TensorXf", material: Material, lobes: "mi.TensorXf", scenes: int
+) -> Radiance:
+    """`reflected_radiance` without visibility at the points of `scenes` S scenes in one launch: each scene's points are
+    consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
+    differentiable in albedos and lobes."""
+    parts = shade_scenes(*_shading_points(normals, views, material), material.roughness, lobes, scenes)
+    return reflect(material, *map(to_columns, parts))
+
+
+def _shading_points(normals, views, material):
+    """Normal, direction to the camera and specular albedo as Dr.Jit vectors."""
+    return (
         from_columns(normals, mi.Vector3f),
         from_columns(-views, mi.Vector3f),
-        from_columns(specular, mi.Float),
-        mi.Float(roughness),
-        lobes,
+        from_columns(material.specular_albedo, mi.Float),
     )
-    irradiance, specular_radiance = to_columns(irradiance), to_columns(specular_radiance)
-    if arrival is not None:
-        irradiance, specular_radiance = received(irradiance, specular_radiance, arrival, albedo)
-    return albedo * irradiance * (1 / np.pi), specular_radiance * k_s
-
-
-def diffuse_radiance(albedo, normals, lobes, arrival=None):
-    """The diffuse part of `physical_radiance` [3, N]; `arrival` is that of `sg.visibility.diffuse_arrival`."""
-    irradiance = to_columns(irradiance_of(from_columns(normals, mi.Vector3f), lobes))
-    if arrival is not None:
-        share, bounced = arrival
-        irradiance = irradiance * share + bounced * albedo
-    return albedo * irradiance * (1 / np.pi)

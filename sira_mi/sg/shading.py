@@ -68,7 +68,7 @@ def specular_radiance_physg(
     joint_axis, joint_sharpness, log_amplitude = product(lobe_axis, lobe_sharpness, axis, sharpness)
     integral = dr.exp(log_amplitude) * cosine_integral(dr.dot(normal, joint_axis), joint_sharpness)
     cos_mirror = dr.maximum(cosine, _MINIMUM_VIEW_COSINE)
-    moment = dr.square(brdf.visibility(cos_mirror, roughness)) * brdf.fresnel(specular_albedo, cos_mirror)
+    moment = dr.square(brdf.masking(cos_mirror, roughness)) * brdf.fresnel(specular_albedo, cos_mirror)
     return amplitude * dr.select(cosine > 0.0, 0.25 * lobe_amplitude * moment * integral, 0.0)
 
 

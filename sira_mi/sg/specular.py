@@ -108,7 +108,7 @@ def mean_half_cosine(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
 def log_energy(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Float", "mi.Float"]:
     """Log of about ∫ f^s (ω·n)₊ dω over the hemisphere for F = 1 and F = P, the limit for small roughness."""
     half = mean_half_cosine(cosine, roughness)
-    white = 2.0 * dr.log(half * brdf.visibility(half, roughness))
+    white = 2.0 * dr.log(half * brdf.masking(half, roughness))
     return white, white + brdf.log_fresnel_weight(half)
 
 
@@ -185,8 +185,8 @@ def _integral(lobes, part, axis, sharpness):
     half = centre + view
     half *= dr.rsqrt(dr.squared_norm(half) + 1e-12)
     distribution = brdf.distribution_sharpness(roughness)
-    masking = brdf.visibility(dr.maximum(dr.dot(normal, view), 0.0), roughness)
-    masking *= brdf.visibility(dr.maximum(dr.dot(normal, centre), 0.0), roughness)
+    masking = brdf.masking(dr.maximum(dr.dot(normal, view), 0.0), roughness)
+    masking *= brdf.masking(dr.maximum(dr.dot(normal, centre), 0.0), roughness)
     reflectance = dr.log(distribution * (0.125 / math.pi) * masking)
     reflectance -= 0.5 * distribution * dr.squared_norm(half - normal)
     if part == "grazing":

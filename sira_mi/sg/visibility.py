@@ -1,17 +1,17 @@
 """Visibility of a light of spherical Gaussians: the share of its diffuse and specular radiance that reaches a point.
 
 Closed-form shading (`sg.shading`) knows no shadows. Here the light's radiance l is also summed over K fixed directions
-ω_k that stand for w_k steradians each, once with and once without what the scene's surfaces block (b_k = 0), and the
-closed form is multiplied by the ratio of the two sums,
+ω_k that stand for w_k steradians each, with and without those in which the scene blocks the light (b_k = 0). The closed
+form is multiplied by the ratio of the two sums,
 
     V = Σ_k w_k l(ω_k) f(ω_k) (n·ω_k)₊ b_k / Σ_k w_k l(ω_k) f(ω_k) (n·ω_k)₊,
 
-a colour, for f = 1 (diffuse) and for the specular reflectance: the ratio estimator of Heitz, Hill and McGuire,
-"Combining Analytic Direct Illumination and Stochastic Shadows" (2018), with the same directions at all points, which
-makes it matrix products. A blocked direction shows another surface instead, taken to face the point and to reflect
-diffusely what it receives of the light; this one bounce is kept apart, to be multiplied by the albedo of that surface.
+a colour, with f = 1 (diffuse) or the specular reflectance: the ratio estimator of Heitz, Hill and McGuire, "Combining
+Analytic Direct Illumination and Stochastic Shadows" (2018). All points share the directions, so the sums are matrix
+products. In a blocked direction the point sees another surface. It is assumed to face the point and to reflect the
+light diffusely; this one bounce is kept apart, to be multiplied by the albedo of that surface.
 
-The directions that are open at a point depend on the geometry alone; they are traced once and serve any light.
+Which directions are unoccluded depends on the geometry alone: they are traced once and serve any light.
 """
 
 import math
@@ -30,7 +30,7 @@ from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions, lobe_count, unp
 
 # The sharpest lobe that K even directions over the sphere resolve, as a share of K.
 _RESOLVED = 0.25
-# Share of the light's energy that is added to both sums of a ratio, which is then 1 where no light arrives.
+# Share of the light's energy that is added to both sums of a ratio, which is then 1 where there is no light.
 _FLOOR = 1e-6
 # Height above the surface at which shadow rays start, in spacings of the grid that the head's mesh is extracted on.
 SHADOW_OFFSET = 0.2
@@ -49,13 +49,13 @@ class Directions:
 
 
 @dataclass(frozen=True, eq=False)
-class Arrival:
-    """What arrives of a light at some points, past the surfaces of the scene."""
+class Visibility:
+    """How much of a light reaches some points, and what the surfaces that block the rest reflect onto them."""
 
-    diffuse: "mi.TensorXf"  # [3, N] share of the irradiance
-    specular: "mi.TensorXf"  # [3, N] share of the specular radiance
-    bounced_diffuse: "mi.TensorXf"  # [3, N] irradiance from blocking surfaces, per unit of their albedo
-    bounced_specular: "mi.TensorXf"  # [3, N] specular radiance of their light, per unit of their albedo
+    diffuse: "mi.TensorXf"  # [3, N] unoccluded share of the irradiance
+    specular: "mi.TensorXf | None"  # [3, N] unoccluded share of the specular radiance; None without a specular term
+    bounce_diffuse: "mi.TensorXf"  # [3, N] irradiance from occluders, per unit of their albedo
+    bounce_specular: "mi.TensorXf | None"  # [3, N] specular radiance of their light, per unit of their albedo
 
 
 def even_directions(count: int) -> Directions:
@@ -109,12 +109,12 @@ def _mixture_density(lobes, energy, direction):
     return np.exp(sharpness * np.minimum(cosine - 1, 0)) @ (energy * peak)
 
 
-def trace_open(
+def trace_unoccluded(
     scene: "mi.Scene", point: np.ndarray, normal: np.ndarray, directions: np.ndarray, offset: float
 ) -> np.ndarray:
     """Whether nothing of the scene lies in each of `directions` [K, 3] from points [3, N] with unit normals [3, N]:
-    bool [K, N]. Directions below the surface count as open. Rays start `offset` scene units above the surface, and as
-    far along themselves again, so that a mesh that is close to the surface does not block its own points."""
+    bool [K, N]. Directions below the surface count as unoccluded. Rays start `offset` scene units above the surface and
+    advance as far again, so that a mesh close to the surface does not block its own points."""
     count, axis = point.shape[1], mi.Float(np.ascontiguousarray(directions, np.float32).ravel())
     start = [mi.Vector3f(np.ascontiguousarray(v, np.float32)) for v in (point + offset * normal, normal)]
     step = max(1, _LAUNCH // max(count, 1))
@@ -147,68 +147,57 @@ def light_radiance(lobes: "mi.TensorXf", directions: Directions) -> "mi.TensorXf
     return (to_columns(amplitude) @ dr.exp(exponent)) * _in_rows(directions.weight, 3)
 
 
-def arrival(
-    normal: "mi.TensorXf",
-    outgoing: "mi.TensorXf",
-    specular: "mi.TensorXf",
+def light_visibility(
+    normals: "mi.TensorXf",
+    views: "mi.TensorXf",
+    specular_albedo: "mi.TensorXf | None",
     roughness: "mi.Float",
     lobes: "mi.TensorXf",
     directions: Directions,
-    is_open: "mi.TensorXf",
-) -> Arrival:
-    """What arrives of the light `lobes` [N_l, 7] at points with unit normals and outgoing directions [3, N], specular
-    albedo [1, N], and open directions `is_open` [K, N] of 0 and 1.
+    unoccluded: "mi.TensorXf",
+) -> Visibility:
+    """Visibility of the light `lobes` [N_l, 7] at points with unit normals and unit views (from the camera to the
+    point) [3, N] and specular albedo [1, N], None without a specular term; `unoccluded` [K, N], 0 or 1, says in which
+    of the directions nothing blocks the light.
 
-    Differentiable in all but `is_open`; gradients have the same bits on every run."""
+    Differentiable in all but `unoccluded`; gradients have the same bits on every run."""
     light, axis = light_radiance(lobes, directions), _constant(directions.axis)
-    cosine, ones = axis @ normal, dr.full(mi.TensorXf, 1.0, (len(directions.axis), 1))
+    cosine = axis @ normals
     light_cosine = dr.maximum(cosine, 0.0)
-    diffuse, bounced_diffuse = _sums(light, directions, cosine, light_cosine, is_open)
+    diffuse, bounce_diffuse = _sums(light, directions, cosine, light_cosine, unoccluded)
+    if specular_albedo is None:
+        return Visibility(diffuse, None, bounce_diffuse, None)
 
-    view_cosine = dr.full(mi.TensorXf, 1.0, (1, 3)) @ (normal * outgoing)
+    outgoing, ones = -views, dr.full(mi.TensorXf, 1.0, (len(directions.axis), 1))
+    view_cosine = dr.full(mi.TensorXf, 1.0, (1, 3)) @ (normals * outgoing)
     # Flat arrays, in which a roughness of one entry needs no broadcast of tensors, whose adjoint would be atomic.
     rough = dr.maximum(mi.Float(roughness), (2.0 / directions.even) ** 0.25)
     half = dr.sqrt(dr.maximum(2.0 + 2.0 * (axis @ outgoing).array, 1e-6))
     gap = dr.maximum(1.0 - (cosine + ones @ view_cosine).array / half, 0.0)
-    reflectance = brdf.distribution(gap, rough) * brdf.fresnel((ones @ specular).array, 0.5 * half)
-    reflectance *= brdf.visibility(light_cosine.array, rough) * light_cosine.array
-    glossy, bounced_glossy = _sums(light, directions, cosine, mi.TensorXf(reflectance, cosine.shape), is_open)
-    masking = 0.25 * brdf.visibility(dr.maximum(view_cosine.array, 0.0), rough)
+    reflectance = brdf.distribution(gap, rough) * brdf.fresnel((ones @ specular_albedo).array, 0.5 * half)
+    reflectance *= brdf.masking(light_cosine.array, rough) * light_cosine.array
+    weight = mi.TensorXf(reflectance, cosine.shape)
+    specular, bounce_specular = _sums(light, directions, cosine, weight, unoccluded)
+    masking = 0.25 * brdf.masking(dr.maximum(view_cosine.array, 0.0), rough)
     masking = mi.TensorXf(dr.select(view_cosine.array > 0.0, masking, 0.0), view_cosine.shape)
-    return Arrival(diffuse, glossy, bounced_diffuse, bounced_glossy * in_three(masking))
+    return Visibility(diffuse, specular, bounce_diffuse, bounce_specular * in_three(masking))
 
 
-def diffuse_arrival(
-    normal: "mi.TensorXf", lobes: "mi.TensorXf", directions: Directions, is_open: "mi.TensorXf"
-) -> tuple["mi.TensorXf", "mi.TensorXf"]:
-    """What `arrival` calls `diffuse` and `bounced_diffuse`, for surfaces without a specular part."""
-    cosine = _constant(directions.axis) @ normal
-    return _sums(light_radiance(lobes, directions), directions, cosine, dr.maximum(cosine, 0.0), is_open)
-
-
-def _sums(light, directions, cosine, weight, is_open):
-    """Share [3, N] of `light` [3, K] that arrives under weights [K, N], and the sum [3, N] of what bounces.
+def _sums(light, directions, cosine, weight, unoccluded):
+    """Unoccluded share [3, N] of `light` [3, K] under weights [K, N], and the weighted sum [3, N] of what occluders
+    reflect, per unit of their albedo.
 
     The surface seen in a blocked direction ω_k receives light from ω_l by (−ω_k·ω_l)₊, for which its expansion to first
     order, ¼ − ½ ω_k·ω_l, is summed over k first and then cut at 0. Light from below the point's own horizon mostly does
     not reach its neighbours either: it fades with 1 + n·ω_l."""
     floor = dr.detach(dr.sum(light, axis=None)) * _FLOOR + 1e-20
-    arriving = weight * is_open
-    share = (light @ arriving + floor) / (light @ weight + floor)
+    open_weight = weight * unoccluded
+    share = (light @ open_weight + floor) / (light @ weight + floor)
     moments = np.concatenate([0.25 * directions.weight[None], -0.5 * directions.weight * directions.axis.T])
     onto = np.concatenate([np.ones((1, len(directions.axis))), directions.axis.T])
-    received = dr.maximum(_constant(onto.T) @ (_constant(moments) @ (weight - arriving)), 0.0)
+    incident = dr.maximum(_constant(onto.T) @ (_constant(moments) @ (weight - open_weight)), 0.0)
     fading = dr.minimum(1.0 + cosine, 1.0)
-    return share, (light @ (received * fading)) * (1 / math.pi)
-
-
-def received(irradiance, specular, arrival: Arrival, bounce_albedo) -> tuple["mi.TensorXf", "mi.TensorXf"]:
-    """Irradiance and specular radiance [3, N] with visibility, of those of the closed form and what arrives;
-    `bounce_albedo` [3, N], or a number, is the diffuse albedo of the surfaces that block."""
-    return (
-        irradiance * arrival.diffuse + arrival.bounced_diffuse * bounce_albedo,
-        specular * arrival.specular + arrival.bounced_specular * bounce_albedo,
-    )
+    return share, (light @ (incident * fading)) * (1 / math.pi)
 
 
 def _in_rows(array, rows):

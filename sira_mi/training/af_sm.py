@@ -15,12 +15,11 @@ from sira_mi.avatar.file import AvatarArchitecture, signed_distance_field
 from sira_mi.avatar.skin_tone import SKIN_LUMINANCE, skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
-from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, evaluate_in_chunks, in_three, surface
 from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import BARE_SKIN
-from sira_mi.sg.scene_shading import shade_scenes
+from sira_mi.sg.radiance import Material, radiance_of_scenes
 from sira_mi.training.scenes import TrainingScene
 
 NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
@@ -181,22 +180,15 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     specular = specular_albedo(speculars, architecture.specular_octaves, batch.x_ref)
     lobes = illumination(layers(networks["illumination"], parameters["illumination"]), z_l)
 
-    irradiance, specular_radiance = shade_scenes(
-        from_columns(batch.normals, mi.Vector3f),
-        from_columns(-batch.views, mi.Vector3f),
-        from_columns(specular, mi.Float),
-        settings.roughness,
-        lobes,
-        batch.count,
-    )
-    radiance = albedo * to_columns(irradiance) * (1 / np.pi) + to_columns(specular_radiance)
+    material = Material(albedo, specular, settings.roughness, 1.0)
+    diffuse_part, specular_part = radiance_of_scenes(batch.normals, batch.views, material, lobes, batch.count)
     skin = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.skin_x_ref, batch.skin_gamma)
     difference = albedo - moved
     anchor = dr.log(specular / batch.specular_level)
     amplitude = dr.log(lobes[:, 4:7, :])
     grey = amplitude - in_three(dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count)), axis=1)
     return {
-        "color": losses.photometric_loss(radiance, batch.colors),
+        "color": losses.photometric_loss(diffuse_part + specular_part, batch.colors),
         "embedding": losses.embedding_loss(z_a) + losses.embedding_loss(z_s) + losses.embedding_loss(z_l),
         "smoothness": losses.mean(dr.abs(difference)),
         "specular_anchor": losses.mean(anchor * anchor),

@@ -18,7 +18,7 @@ from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface, extra
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance, surface
 from sira_mi.files import write_png
-from sira_mi.sg.radiance import physical_radiance
+from sira_mi.sg.radiance import Material, reflected_radiance
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
 
@@ -183,7 +183,8 @@ class AppearancePicture:
                 albedo = diffuse_albedo(diffuse, self.architecture.albedo_octaves, x_ref, gamma)
                 shine = specular_albedo(specular, self.architecture.specular_octaves, x_ref)
                 views = mi.TensorXf(np.repeat(away[:, None], x_ref.shape[1], axis=1))
-                lit = [physical_radiance(albedo, shine, normals, views, self.roughness, 1.0, light) for light in lights]
+                material = Material(albedo, shine, self.roughness, 1.0)
+                lit = [reflected_radiance(normals, views, material, light) for light in lights]
                 return albedo, shine, *(a + b for a, b in lit)
 
             albedo, shine, *lit = evaluate_in_chunks(colors, *frozen)

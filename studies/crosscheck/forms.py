@@ -3,8 +3,7 @@ and direct light by Monte Carlo, with shadows and without."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,10 +11,10 @@ import numpy as np
 
 from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.sdf import evaluate_in_chunks
-from sira_mi.plugins.sira_sg import open_directions, rotation_of
+from sira_mi.plugins.sira_sg import rotation_of, unoccluded_directions
 from sira_mi.sg import brdf, shading, visibility
 from sira_mi.sg.lobes import lobe_count, unpack_lobe
-from sira_mi.sg.radiance import physical_radiance
+from sira_mi.sg.radiance import Material, reflect, reflected_radiance
 from sira_mi.sg.sampling import LobeMixture
 from studies.crosscheck.points import Points
 from studies.stability import double
@@ -44,8 +43,9 @@ def closed_form(points: Points, lobes: np.ndarray, roughness: float, k_s: float)
     light = _tensor(lobes)
 
     def columns(normal, view, diffuse, specular):
-        parts = physical_radiance(diffuse, specular, normal, -view, roughness, mi.TensorXf(k_s, (1, 1)), light)
-        return parts[0] + parts[1]
+        material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
+        radiance = reflected_radiance(normal, -view, material, light)
+        return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(columns, points.normal, points.view, points.diffuse, points.specular)[0]
 
@@ -60,14 +60,12 @@ def with_visibility(
     factor = 1.0 if bounce else 0.0
 
     def columns(x, normal, view, diffuse, specular):
-        is_open = open_directions(scene, head, x, normal, directions)
-        arrival = visibility.arrival(normal, view, specular, roughness, light, directions, is_open)
-        arrival = visibility.Arrival(
-            arrival.diffuse, arrival.specular, arrival.bounced_diffuse * factor, arrival.bounced_specular * factor
-        )
-        k = mi.TensorXf(k_s, (1, 1))
-        parts = physical_radiance(diffuse, specular, normal, -view, roughness, k, light, arrival)
-        return parts[0] + parts[1]
+        unoccluded = unoccluded_directions(scene, head, x, normal, directions)
+        seen = visibility.light_visibility(normal, -view, specular, roughness, light, directions, unoccluded)
+        seen = replace(seen, bounce_diffuse=seen.bounce_diffuse * factor, bounce_specular=seen.bounce_specular * factor)
+        material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
+        radiance = reflected_radiance(normal, -view, material, light, seen)
+        return radiance.diffuse + radiance.specular
 
     diffuse, specular = albedos or (points.diffuse, points.specular)
     return evaluate_in_chunks(columns, points.x, points.normal, points.view, diffuse, specular)[0]
@@ -106,7 +104,7 @@ def physg(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np
         warped_axis, warped_sharpness, warped_amplitude = shading.specular_lobe(n, v, roughness)
         cosine = dr.dot(n, v)
         safe = dr.maximum(cosine, 1e-3)
-        moment = 0.25 * warped_amplitude * dr.square(brdf.visibility(safe, roughness)) * brdf.fresnel(s, safe)
+        moment = 0.25 * warped_amplitude * dr.square(brdf.masking(safe, roughness)) * brdf.fresnel(s, safe)
         irradiance, glossy = mi.Color3f(0.0), mi.Color3f(0.0)
         for index in range(lobe_count(light)):
             axis, sharpness, amplitude = unpack_lobe(light.array, index)
@@ -116,7 +114,9 @@ def physg(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np
             exponent = dr.exp(length - warped_sharpness - sharpness)
             glossy += amplitude * exponent * _physg_cosine_integral(n, joint / length, length)
         glossy = dr.select(cosine > 0, glossy * moment, 0.0)
-        return diffuse * to_columns(irradiance) * (1 / math.pi) + k_s * to_columns(glossy)
+        material = Material(diffuse, specular, roughness, k_s)
+        radiance = reflect(material, to_columns(irradiance), to_columns(glossy))
+        return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(columns, points.normal, points.view, points.diffuse, points.specular)[0]
 
@@ -178,7 +178,7 @@ def direct_light(
         radiance, density = mixture.evaluate(direction)
         half = dr.normalize(dr.select(above, view + direction, normal))
         core = 0.25 * brdf.distribution(0.5 * dr.squared_norm(half - normal), rough)
-        core *= brdf.visibility(dr.maximum(cos_view, 0.0), rough) * brdf.visibility(dr.maximum(cos_light, 0.0), rough)
+        core *= brdf.masking(dr.maximum(cos_view, 0.0), rough) * brdf.masking(dr.maximum(cos_light, 0.0), rough)
         density += dr.maximum(cos_light, 0.0) * dr.inv_pi + brdf.reflected_density(normal, view, direction, rough)
         weight = dr.select(above, radiance * cos_light / dr.maximum(density, 1e-12), 0.0)
         return above, weight, core, brdf.fresnel_weight(dr.dot(view, half))

@@ -29,6 +29,7 @@ from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.optimisation.adam import adam, parameter_values
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.sg.radiance import Material, reflect, reflected_radiance
 from sira_mi.sg.shading import shade
 from sira_mi.training import af_sm
 from sira_mi.training.prior import whitening
@@ -205,7 +206,8 @@ def factors(avatar: Avatar, latents: dict[str, np.ndarray], inputs: Sequence[np.
             lobes,
         )
         irradiance, glossy = (to_columns(part) for part in parts)
-        return albedo, f0, irradiance, albedo * irradiance * (1 / np.pi) + glossy
+        radiance = reflect(Material(albedo, f0, avatar.roughness, 1.0), irradiance, glossy)
+        return albedo, f0, irradiance, radiance.diffuse + radiance.specular
 
     return Factors(*evaluate_in_chunks(evaluate, *inputs, views))
 
@@ -372,8 +374,8 @@ def _evenly_lit(fitted: Factors, normal: np.ndarray, view: np.ndarray, roughness
     lobes = mi.TensorXf(np.array([[0, 1, 0, 1e-3, 1, 1, 1]], np.float32))
 
     def evaluate(albedo, f0, normal, view):
-        parts = af_sm.physical_radiance(albedo, f0, normal, view, roughness, 1.0, lobes)
-        return parts[0] + parts[1]
+        radiance = reflected_radiance(normal, view, Material(albedo, f0, roughness, 1.0), lobes)
+        return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(evaluate, fitted.albedo, fitted.specular, normal, view)[0]
 
