@@ -11,7 +11,7 @@ from PIL import Image
 from sira_mi.errors import InputError
 
 
-def write_through(path: str | Path, write: Callable[[Path], None]) -> None:
+def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
     """Calls `write` with a temporary path of the same ending beside `path`, then renames it.
 
     Raises InputError when the place cannot be written or is full; nothing is left behind then."""
@@ -26,6 +26,11 @@ def write_through(path: str | Path, write: Callable[[Path], None]) -> None:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """A text file in UTF-8. Raises InputError as `write_through` does."""
+    write_through(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> None:

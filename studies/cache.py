@@ -1,11 +1,11 @@
-"""Results of measurements as JSON files, measured again only when what they depend on has changed."""
+"""Results of measurements as JSON files, computed again only when what they depend on has changed."""
 
 import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 
-from sira_mi.files import write_through
+from sira_mi.files import write_text
 
 
 def fingerprint(*parts: Path | str) -> str:
@@ -17,21 +17,25 @@ def fingerprint(*parts: Path | str) -> str:
     return digest.hexdigest()[:16]
 
 
-def cached(path: Path, key: str, compute: Callable[[], dict], files: tuple[Path, ...] = ()) -> dict:
+def load_or_compute(path: Path, key: str, compute: Callable[[], dict], files: tuple[Path, ...] = ()) -> dict:
     """The result that `path` holds under `key`; otherwise that of `compute()`, which is written there. `files` are
-    further files that `compute` writes: if one is missing, it is called again."""
+    further files that `compute` writes; when one is missing, it is called again."""
     stored = read(path)
     if stored is not None and stored.get("key") == key and all(file.exists() for file in files):
         return stored["result"]
     result = compute()
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"key": key, "result": result}, indent=1)
-    write_through(path, lambda file: file.write_text(text, encoding="utf-8"))
-    return json.loads(text)["result"]
+    write_json(path, {"key": key, "result": result})
+    return json.loads(json.dumps(result))
+
+
+def write_json(path: Path, value: dict | list) -> None:
+    """Writes a value as JSON. Raises InputError when the place cannot be written."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
 
 
 def read(path: Path) -> dict | None:
-    """`{"key": ..., "result": ...}` of a file by `cached`; None when there is none or it is damaged."""
+    """`{"key": ..., "result": ...}` of a file by `load_or_compute`; None when there is none or it is damaged."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
         return stored if isinstance(stored["result"], dict) else None

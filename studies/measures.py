@@ -1,5 +1,5 @@
-"""Measures of numbers and images against the truth, free of any model: statistics, PSNR, SSIM, scaling, leakage; and
-what all evaluations call the face, the head and specular strength."""
+"""Measures of numbers and images against the truth: statistics, SSIM, scaling, leakage, each independent of any model;
+and the definitions of face, head and specular strength that all studies share. PSNR is `relight.pictures.psnr`."""
 
 import numpy as np
 from skimage.metrics import structural_similarity
@@ -9,7 +9,7 @@ from sira_mi.conventions import LUMINANCE
 FACE_RADIUS = 95.0  # mm around the nose tip
 SHOULDERS = -1.3  # y above which a point belongs to the head, scene units
 F0_OF_STRENGTH = 0.08  # reflectance at normal incidence of specular strength 1
-_PEAK_NOISE = 1e-12
+_SMALLEST_SQUARE = 1e-12
 
 
 def statistics(values: np.ndarray) -> dict[str, float]:
@@ -23,16 +23,9 @@ def statistics(values: np.ndarray) -> dict[str, float]:
     }
 
 
-def psnr(values: np.ndarray, truth: np.ndarray) -> float:
-    """PSNR in dB with peak 1 of arrays of one shape; NaN when they are empty."""
-    if not truth.size:
-        return float("nan")
-    return float(-10 * np.log10(max(np.mean((np.asarray(values, np.float64) - truth) ** 2), _PEAK_NOISE)))
-
-
-def channel_scaled(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """`values` [N, C] times the factor of each channel that brings them nearest to `truth` in least squares."""
-    return values * ((values * truth).sum(axis=0) / np.maximum((values * values).sum(axis=0), _PEAK_NOISE))
+def scale_channels(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """`values` [N, C] times the factor of each channel that brings them closest to `truth` in least squares."""
+    return values * ((values * truth).sum(axis=0) / np.maximum((values * values).sum(axis=0), _SMALLEST_SQUARE))
 
 
 def ssim_inside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:

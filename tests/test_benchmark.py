@@ -22,15 +22,15 @@ from sira_mi.training.collection.render import Part, RenderSettings, build_scene
 from sira_mi.training.collection.sources.makehuman import MakeHumanSource
 from studies.portraits import benchmark
 from studies.portraits.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
+from studies.portraits.benchmark_photo import PhotoSettings, View, level_parts, portrait_camera
 from studies.portraits.benchmark_plan import (
     BenchmarkSettings,
     Identity,
     choose_identities,
     heads_of,
-    named_sources,
     plan,
+    select_sources,
 )
-from studies.portraits.benchmark_portraits import PhotoSettings, View, level_parts, portrait_camera
 from studies.portraits.truth import load_truth
 
 TINY = PhotoSettings(size=48, samples=16, depth=3, shading_samples=64)
@@ -391,25 +391,25 @@ def test_portraits_that_are_there_are_kept(built, collection, monkeypatch):
     assert taken == [entries[1]["name"]] and photo.read_bytes() == before
     finer = replace(settings.photo, samples=16)
     head = plan(choose_identities(heads_of(collection, "test")[:1], 1, 0), [], settings)[0]
-    assert all(benchmark.finished_entry(folder / shot.name, shot.key(settings.photo)) for shot in head)
-    assert not any(benchmark.finished_entry(folder / shot.name, shot.key(finer)) for shot in head)
+    assert all(benchmark.read_entry(folder / shot.name, shot.key(settings.photo)) for shot in head)
+    assert not any(benchmark.read_entry(folder / shot.name, shot.key(finer)) for shot in head)
 
 
 def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
     """Sources without data, unknown sources, a head that the data do not give again, no maps, damaged files."""
     none = dict.fromkeys(("hair", "ict", "valid", "meshes"))
     with pytest.raises(InputError, match="give its data by --valid"):
-        named_sources(collection, "test", None, none)
+        select_sources(collection, "test", None, none)
     with pytest.raises(InputError, match="no test heads of ict"):
-        named_sources(collection, "test", ["ict"], none)
-    assert [source.name for source in named_sources(collection, "test", ["makehuman"], none)] == ["makehuman"]
+        select_sources(collection, "test", ["ict"], none)
+    assert [source.name for source in select_sources(collection, "test", ["makehuman"], none)] == ["makehuman"]
     assert heads_of(collection, "train") == []
     with pytest.raises(InputError, match="no train heads of makehuman"):
         settings = BenchmarkSettings(split="train")
         benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), None, 1, settings)
     head = heads_of(collection, "test")[0]
     with pytest.raises(InputError, match="is not the collection's"):
-        benchmark.rebuilt(MakeHumanSource(8, None), replace(head, person={"other": 1}))
+        benchmark.rebuild_subject(MakeHumanSource(8, None), replace(head, person={"other": 1}))
     with pytest.raises(InputError, match=r"no \.exr"):
         benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), tmp_path, 1)
     with pytest.raises(InputError, match="no benchmark"):

@@ -24,8 +24,8 @@ from sira_mi.portrait.head_landmarks import (
     upright_axes,
 )
 from sira_mi.training.landmark_regression import landmark_tensors
-from studies.portraits.landmark_errors import Observation, fitted_correction, held_out_errors
-from studies.priors import landmark_places
+from studies.portraits.measure_landmarks import Observation, fit_correction, measure_held_out_errors
+from studies.priors import fit_landmark_model
 
 MEAN = np.random.default_rng(11).uniform(-0.5, 0.5, (LANDMARKS, 3))
 MEAN[[33, 263]] = (-0.2, -0.1, -0.2), (0.2, -0.1, -0.2)
@@ -77,18 +77,18 @@ def test_the_correction_turns_and_grows_with_the_photo(face):
 def test_errors_that_follow_from_the_direction_are_learned():
     """They are gone on other heads; beyond what was measured the correction stays where it was."""
     known = observations(200, seed=1)
-    correction = fitted_correction(known)
+    correction = fit_correction(known)
     for o in observations(20, seed=2):
         left = np.nanmean(np.linalg.norm(head_landmarks(o.face, correction) - o.true, axis=1))
         assert left < 0.15 * np.nanmean(np.linalg.norm(o.face.landmarks - o.true, axis=1))
-    found, corrected = held_out_errors(known)
+    found, corrected = measure_held_out_errors(known)
     assert corrected < 0.15 * found
     assert found == pytest.approx(np.mean([np.nanmean(np.linalg.norm(o.offset, axis=1)) for o in known]))
     near, far = (turned(yaw, 0, 0) for yaw in (0.8, 2.0))
     near, far = ((head_landmarks(f, correction) - f.landmarks) @ upright_axes(f).T / f.size for f in (near, far))
     assert np.abs(far - near).mean() < 0.02 < 0.04 < np.abs(near).mean()
     with pytest.raises(InputError) as error:
-        held_out_errors(known[:8])
+        measure_held_out_errors(known[:8])
     one_line(error, "4 heads")
 
 
@@ -136,12 +136,12 @@ def found(prior):
     true = prior.tensors["landmarks"] + np.tensordot(w, 0.2 * rng.standard_normal((3, LANDMARKS, 3)), axes=1)
     true -= true.mean(axis=0) - prior.tensors["landmarks"]
     true[4, 7] = np.nan
-    return landmark_places.Places(placed.astype(np.float32), true.astype(np.float32))
+    return fit_landmark_model.Places(placed.astype(np.float32), true.astype(np.float32))
 
 
 def test_a_prior_learns_where_its_heads_carry_landmarks(prior, found, tmp_path):
     """A linear relation is found, kept in the prior's file, and holds on heads left out; without it, places stay."""
-    learned = landmark_places.with_landmark_model(prior, found)
+    learned = fit_landmark_model.add_landmark_model(prior, found)
     save_avatar(tmp_path / "prior.safetensors", learned)
     learned = load_avatar(tmp_path / "prior.safetensors")
     known = np.isfinite(prior.tensors["landmarks"]).all(axis=1)
@@ -149,11 +149,11 @@ def test_a_prior_learns_where_its_heads_carry_landmarks(prior, found, tmp_path):
     error = np.linalg.norm(LandmarkModel(learned)(placed).numpy().T - found.true[9, known], axis=1)
     assert error.mean() < 0.05 * np.linalg.norm(found.placed[9, known] - found.true[9, known], axis=1).mean()
     assert np.array_equal(LandmarkModel(prior)(placed).numpy(), placed.numpy())
-    before, after = landmark_places.held_out_errors(prior, found)
+    before, after = fit_landmark_model.measure_held_out_errors(prior, found)
     assert after < 0.1 * before
-    assert landmark_places.bare(learned).tensors.keys() == prior.tensors.keys()
+    assert fit_landmark_model.without_landmark_model(learned).tensors.keys() == prior.tensors.keys()
     with pytest.raises(InputError) as few:
-        landmark_places.held_out_errors(prior, landmark_places.Places(found.placed[:3], found.true[:3]))
+        fit_landmark_model.measure_held_out_errors(prior, fit_landmark_model.Places(found.placed[:3], found.true[:3]))
     one_line(few, "3 training heads")
 
 
@@ -199,7 +199,7 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
     from sira_mi.fit.settings import QUALITIES
     from sira_mi.portrait.portrait import Portrait
 
-    learned = landmark_places.with_landmark_model(prior, found)
+    learned = fit_landmark_model.add_landmark_model(prior, found)
     path = tmp_path / "prior.safetensors"
     save_avatar(path, learned)
     view = camera(focal=70, size=64)

@@ -6,6 +6,7 @@ from sira_mi.portrait.load import linear_to_srgb
 
 # The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
 _BRIGHTEST_SPECULAR = 0.08
+_PEAK_NOISE = 1e-12  # least mean squared error that counts
 
 
 # Channels of the `sira_sg` film: first channel and number of channels of every layer.
@@ -39,10 +40,14 @@ def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return linear_to_srgb(image)
 
 
+def psnr(values: np.ndarray, truth: np.ndarray) -> float:
+    """PSNR in dB with peak 1 of arrays of one shape, at most 120 dB; NaN when they are empty."""
+    if not truth.size:
+        return float("nan")
+    return float(-10 * np.log10(max(np.mean((np.asarray(values, np.float64) - truth) ** 2), _PEAK_NOISE)))
+
+
 def psnr_inside(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
     """PSNR in dB of two linear images [H, W, 3], measured on sRGB values inside mask > 0.5."""
-    inside = mask > 0.5
-    if not inside.any():
-        return float("nan")
-    difference = linear_to_srgb(np.clip(image, 0, 1))[inside] - linear_to_srgb(np.clip(reference, 0, 1))[inside]
-    return float(-10 * np.log10(max(np.mean(difference**2), 1e-12)))
+    first, second = (linear_to_srgb(np.clip(picture, 0, 1))[mask > 0.5] for picture in (image, reference))
+    return psnr(first, second)

@@ -12,7 +12,7 @@ import numpy as np
 
 from sira_mi.avatar.file import PRIOR
 from sira_mi.files import write_through
-from studies.cache import cached, fingerprint
+from studies.cache import fingerprint, load_or_compute
 from studies.crosscheck.case import Case
 from studies.crosscheck.causes import Row
 from studies.crosscheck.curves import Limit, Point
@@ -71,7 +71,7 @@ def kept(folder: Path | None, name: str, key: str, compute: Callable[[], Lit]) -
         scalars = {n: getattr(lit, n) for n in ("light", "level", "agreement", "seconds", "launches", "non_finite")}
         return {**scalars, "reference": numbers, **lists}
 
-    stored = cached(folder / f"{stem}.json", key, measured, (arrays,))
+    stored = load_or_compute(folder / f"{stem}.json", key, measured, (arrays,))
     with np.load(arrays, allow_pickle=False) as data:
         parts = {
             kind: {name.removeprefix(kind): data[name] for name in data.files if name.startswith(kind)}

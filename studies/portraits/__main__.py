@@ -71,9 +71,10 @@ def compare_fits(arguments: argparse.Namespace) -> None:
     import mitsuba as mi
 
     from sira_mi.avatar.file import PRIOR
-    from studies.portraits.fits import Comparison, compare, write_rows
+    from studies.cache import write_json
+    from studies.portraits.compare_methods import Comparison, compare
     from studies.portraits.methods import BY_NAME
-    from studies.portraits.results_page import SHIPPED, Described, write_results
+    from studies.portraits.page import SHIPPED, Described, write_results
 
     mi.set_variant(arguments.variant)
 
@@ -90,7 +91,7 @@ def compare_fits(arguments: argparse.Namespace) -> None:
             variant=arguments.variant,
         )
         found = compare(comparison)
-        write_rows(arguments.runs / quality / "rows.json", found)
+        write_json(arguments.runs / quality / "rows.json", found)
         return found
 
     ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
@@ -107,7 +108,7 @@ def measure_skin(arguments: argparse.Namespace) -> None:
     import numpy as np
 
     mi.set_variant(arguments.variant)
-    from studies.portraits.skin_level import estimate, observe
+    from studies.portraits.measure_skin import estimate, observe
 
     observations, blind = observe(arguments.benchmark)
     found = estimate(observations)
@@ -125,17 +126,17 @@ def correct_landmarks(arguments: argparse.Namespace) -> None:
     from sira_mi.avatar.file import load_avatar, save_avatar
     from sira_mi.portrait.head_landmarks import CORRECTION
     from sira_mi.training.scenes import load_training_scenes
-    from studies.portraits import landmark_errors
-    from studies.priors import landmark_places
+    from studies.portraits import measure_landmarks
+    from studies.priors import fit_landmark_model
 
-    prior = landmark_places.bare(load_avatar(arguments.prior))
-    observations, blind = landmark_errors.observe(arguments.benchmark)
-    found, corrected = landmark_errors.held_out_errors(observations)
-    places = landmark_places.places(prior, load_training_scenes(arguments.collection))
-    placed, modelled = landmark_places.held_out_errors(prior, places)
+    prior = fit_landmark_model.without_landmark_model(load_avatar(arguments.prior))
+    observations, blind = measure_landmarks.observe(arguments.benchmark)
+    found, corrected = measure_landmarks.measure_held_out_errors(observations)
+    places = fit_landmark_model.place_landmarks(prior, load_training_scenes(arguments.collection))
+    placed, modelled = fit_landmark_model.measure_held_out_errors(prior, places)
     make_folder(arguments.out)
-    landmark_errors.fitted_correction(observations).save(arguments.out / CORRECTION.name)
-    save_avatar(arguments.out / "prior.safetensors", landmark_places.with_landmark_model(prior, places))
+    measure_landmarks.fit_correction(observations).save(arguments.out / CORRECTION.name)
+    save_avatar(arguments.out / "prior.safetensors", fit_landmark_model.add_landmark_model(prior, places))
     print(
         f"{len(observations)} portraits of {len({o.head for o in observations})} heads, {len(blind)} without a face: "
         f"found landmarks {100 * found:.2f}% of the face off, corrected {100 * corrected:.2f}%"
@@ -154,8 +155,8 @@ def make_folder(folder: Path) -> None:
 def make_benchmark(arguments: argparse.Namespace) -> None:
     """Builds the benchmark that the command line describes and prints what it holds."""
     from studies.portraits.benchmark import build_benchmark
-    from studies.portraits.benchmark_plan import BenchmarkSettings, named_sources
-    from studies.portraits.benchmark_portraits import PhotoSettings
+    from studies.portraits.benchmark_photo import PhotoSettings
+    from studies.portraits.benchmark_plan import BenchmarkSettings, select_sources
 
     for name in ("workers", "heads"):
         if getattr(arguments, name) < 1:
@@ -165,7 +166,7 @@ def make_benchmark(arguments: argparse.Namespace) -> None:
     if arguments.samples not in (1, 4, 16, 64, 256, 1024):
         raise InputError("--samples must be a power of 4 up to 1024")
     data = {name: getattr(arguments, name) for name in ("hair", "ict", "valid", "meshes")}
-    sources = named_sources(arguments.collection, arguments.split, arguments.sources, data)
+    sources = select_sources(arguments.collection, arguments.split, arguments.sources, data)
     start = time.monotonic()
     settings = BenchmarkSettings(
         identities=arguments.heads,

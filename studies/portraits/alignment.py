@@ -30,7 +30,7 @@ class Icp:
     damping: float = 1e-3  # weight of each point's squared motion beside its squared distance to the tangent plane
 
 
-def shared_landmarks(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def select_shared_landmarks(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Those of the six landmarks that are known on both sides, of [468, 3] with NaN where unknown: [n, 3] of each.
 
     Raises InputError for fewer than four."""

@@ -14,8 +14,9 @@ from scipy.ndimage import binary_erosion
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.relight.pictures import psnr
 from sira_mi.training.collection.skin import SKIN
-from studies.measures import F0_OF_STRENGTH, channel_scaled, correlation, luminance, psnr, ssim_inside
+from studies.measures import F0_OF_STRENGTH, correlation, luminance, scale_channels, ssim_inside
 from studies.portraits.truth import Truth, check_array
 
 _EDGE = np.ones((3, 3), bool)  # what is eroded: a pixel, its sides and corners
@@ -68,12 +69,12 @@ def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str,
         values = np.where(finite, values, 0).astype(np.float64)
         scores |= image_scores(f"{name}_", values, true, inside)
         if name in ("diffuse", "specular"):
-            scores |= image_scores(f"{name}_scaled_", _scaled_inside(values, true, inside), true, inside)
+            scores |= image_scores(f"{name}_scaled_", _scale_inside(values, true, inside), true, inside)
         if name == "diffuse":
             albedo = values[skin]
     true = truth.diffuse_albedo[skin].astype(np.float64)
     scores |= colour_scores("skin_", albedo, true)
-    scores |= colour_scores("skin_scaled_", channel_scaled(albedo, true), true)
+    scores |= colour_scores("skin_scaled_", scale_channels(albedo, true), true)
     scores |= leakage_scores(albedo, true, truth.shading[skin], truth.shadow[skin])
     return scores
 
@@ -117,9 +118,9 @@ def leakage_scores(albedo: np.ndarray, truth: np.ndarray, shading: np.ndarray, s
     }
 
 
-def _scaled_inside(values, truth, inside):
+def _scale_inside(values, truth, inside):
     """An image times the factor of each channel that is best inside the mask, black outside."""
     image = np.zeros(values.shape)
     flat = (a[inside].reshape(inside.sum(), values[0, 0].size) for a in (values, truth))
-    image[inside] = channel_scaled(*flat).reshape(values[inside].shape)
+    image[inside] = scale_channels(*flat).reshape(values[inside].shape)
     return image

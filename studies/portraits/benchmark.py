@@ -28,7 +28,9 @@ from sira_mi.training.collection.build import VARIANT
 from sira_mi.training.collection.render import exposure
 from sira_mi.training.collection.skin import CLOTH
 from sira_mi.training.collection.subject import BrokenHead, Source, Subject
+from studies.cache import write_json
 from studies.portraits.benchmark_lights import BRIGHTEST, backdrop, light_map
+from studies.portraits.benchmark_photo import NOTHING, PhotoSettings, View, draw_roughness, portrait_camera
 from studies.portraits.benchmark_plan import (
     FORMAT,
     BenchmarkSettings,
@@ -38,7 +40,6 @@ from studies.portraits.benchmark_plan import (
     heads_of,
     plan,
 )
-from studies.portraits.benchmark_portraits import NOTHING, PhotoSettings, View, draw_roughness, portrait_camera
 
 TRUTH = {
     "K": "[3, 3] f4, pixels",
@@ -102,8 +103,10 @@ def build_benchmark(
             entries = [entry for some in bar(pool.imap(work, tasks)) for entry in some]
     else:
         entries = [entry for some in bar(map(work, tasks)) for entry in some]
-    text = json.dumps({"format": FORMAT, "settings": asdict(settings), "truth": TRUTH, "portraits": entries}, indent=1)
-    write_through(out / "benchmark.json", lambda file: file.write_text(text, encoding="utf-8"))
+    write_json(
+        out / "benchmark.json",
+        {"format": FORMAT, "settings": asdict(settings), "truth": TRUTH, "portraits": entries},
+    )
     return entries
 
 
@@ -116,14 +119,14 @@ def _limit_threads(count: int) -> None:
 def take_portraits(task: tuple[Source, list[Shot]], out: Path, photo: PhotoSettings) -> list[dict]:
     """Entries of the portraits of one head; those that are not in `out` under the same key are taken now."""
     source, shots = task
-    entries = {shot.name: finished_entry(out / shot.name, shot.key(photo)) for shot in shots}
+    entries = {shot.name: read_entry(out / shot.name, shot.key(photo)) for shot in shots}
     if all(entries.values()):
         return list(entries.values())
     if mi.variant() != VARIANT:
         mi.set_variant(VARIANT)
     started = time.process_time()
     identity, pose = shots[0].identity, shots[0].pose
-    subject = rebuilt(source, identity)
+    subject = rebuild_subject(source, identity)
     camera = portrait_camera(subject.parts, pose.yaw, pose.pitch, pose.focal_35mm, pose.extent, photo.size)
     roughness = draw_roughness(np.random.default_rng([identity.seed, 51]))
     view = View(subject.parts, roughness, *camera, photo)
@@ -138,7 +141,7 @@ def take_portraits(task: tuple[Source, list[Shot]], out: Path, photo: PhotoSetti
     return list(entries.values())
 
 
-def rebuilt(source: Source, identity: Identity) -> Subject:
+def rebuild_subject(source: Source, identity: Identity) -> Subject:
     """The subject of a head. Raises InputError unless it is the one of the collection."""
     try:
         subject = source.subject(identity.number, identity.seed)
@@ -216,11 +219,10 @@ def write_portrait(folder: Path, image: np.ndarray, arrays: dict, shot: Shot, en
             np.savez_compressed(opened, **arrays)
 
     write_through(folder / "truth.npz", save)
-    text = json.dumps({"key": key, "entry": entry}, indent=1)
-    write_through(folder / "portrait.json", lambda file: file.write_text(text, encoding="utf-8"))
+    write_json(folder / "portrait.json", {"key": key, "entry": entry})
 
 
-def finished_entry(folder: Path, key: str) -> dict | None:
+def read_entry(folder: Path, key: str) -> dict | None:
     """The entry of a complete portrait built under `key`, else None."""
     try:
         stored = json.loads((folder / "portrait.json").read_text(encoding="utf-8"))

@@ -17,8 +17,8 @@ from sira_mi.training.collection.skin import CLOTH, HAIR, SKIN
 from sira_mi.training.collection.subject import Source
 from studies.cache import fingerprint
 from studies.portraits.benchmark_lights import EXTREMES, LIGHTS
-from studies.portraits.benchmark_portraits import PhotoSettings
-from studies.priors.shape_prior import manifest_entries
+from studies.portraits.benchmark_photo import PhotoSettings
+from studies.priors.shape_measures import manifest_entries
 
 FORMAT = "sira-mi benchmark 1"
 # Identities are drawn from the sources in these proportions, as far as there are test heads.
@@ -108,7 +108,7 @@ class Shot:
         }
 
 
-def named_sources(
+def select_sources(
     collection: Path, split: str, names: list[str] | None, data: dict[str, Path | None]
 ) -> tuple[Source, ...]:
     """The sources of a collection's heads of `split`, or those of them in `names`, over the data (by the names `hair`,

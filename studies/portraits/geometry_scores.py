@@ -37,16 +37,16 @@ from studies.portraits.alignment import (
     icp,
     inverse,
     landmark_alignment,
-    shared_landmarks,
+    select_shared_landmarks,
 )
 from studies.portraits.surface_distance import TriangleTree
 from studies.portraits.truth import Truth, check_array, check_mesh
 from studies.portraits.visible_surface import (
     MeshImages,
     OuterSurface,
+    is_seen_by_camera,
     mesh_images,
     outer_surface,
-    seen_by_camera,
 )
 
 ALIGNMENTS = ("h3ds", "landmarks", "camera", "camera_raw")
@@ -139,7 +139,7 @@ def score_geometry(
     settings = settings or GeometrySettings()
     prediction.check(truth.camera.height, truth.camera.width)
     surface = surface or true_surface(truth, settings)
-    predicted, true = shared_landmarks(prediction.landmarks, truth.landmarks)
+    predicted, true = select_shared_landmarks(prediction.landmarks, truth.landmarks)
     placed = landmark_alignment(predicted, true)
     # The samples are drawn in the truth's frame, so that they are above its plane.
     outer = outer_surface(
@@ -220,7 +220,7 @@ def _regions(truth, surface, points, nearest, nearest_face) -> dict[str, np.ndar
     head = points[:, 1] > SHOULDERS
     near = head & (np.linalg.norm(points - surface.nose, axis=1) * MILLIMETRES_PER_UNIT < FACE_RADIUS)
     bare = np.isin(surface.face_region[nearest_face], (SKIN, EYE))
-    seen = seen_by_camera(surface.outer.scene, truth.camera, nearest, surface.outer.normals[nearest_face])
+    seen = is_seen_by_camera(surface.outer.scene, truth.camera, nearest, surface.outer.normals[nearest_face])
     return dict(zip(REGIONS, (near & bare, near, head, head & seen, head & ~seen), strict=True))
 
 

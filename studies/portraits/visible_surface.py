@@ -74,7 +74,7 @@ def ray_scene(vertices: np.ndarray, faces: np.ndarray) -> mi.Scene:
     return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
-def seen_by_camera(scene: mi.Scene, camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def is_seen_by_camera(scene: mi.Scene, camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Whether points [N, 3] on a surface with normals [N, 3] of either sign are in the camera's frame and nothing of
     the scene lies in between, bool [N]."""
     pixel = camera.project(points)

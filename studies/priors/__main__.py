@@ -28,10 +28,10 @@ def main() -> None:
 
     import mitsuba as mi
 
-    from studies.priors.ablations import run_ablations, run_sizes
-    from studies.priors.appearance_evidence import measure_appearance_prior, run_appearance_ablations
-    from studies.priors.prior_page import write_page
-    from studies.priors.shape_evidence import measure_shape_prior
+    from studies.priors.measure_appearance import measure_appearance_prior, run_appearance_ablations
+    from studies.priors.measure_shape import measure_shape_prior
+    from studies.priors.page import write_page
+    from studies.priors.short_trainings import run_ablations, run_sizes
 
     mi.set_variant(arguments.variant)
     evidence = arguments.runs / "evidence"

@@ -15,7 +15,7 @@ import numpy as np
 from sira_mi.avatar.file import PRIOR
 from sira_mi.errors import InputError
 from sira_mi.files import write_png, write_through
-from studies.cache import cached, fingerprint
+from studies.cache import fingerprint, load_or_compute
 from studies.stability.fit_cases import CASES, Case, Fed
 from studies.stability.rows import non_finite
 
@@ -51,7 +51,7 @@ def fitted(fit: Fit, work: Path) -> dict:
     key = fingerprint(described, fit.truth / "truth.npz", PRIOR, *code)
     path = work / "fits" / f"{fit.case.replace(' ', '_')}_{fit.seed}.json"
     try:
-        return cached(path, key, lambda: _in_process(fit, path))
+        return load_or_compute(path, key, lambda: _in_process(fit, path))
     except CrashedError as error:
         return {"crashed": error.args[0]}
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from sira_mi.training.collection.sources.makehuman import MakeHumanSource
 from studies.portraits.benchmark import take_portraits
+from studies.portraits.benchmark_photo import PhotoSettings
 from studies.portraits.benchmark_plan import Identity, Pose, Shot
-from studies.portraits.benchmark_portraits import PhotoSettings
 
 NUMBER, SEED = 7, 800_103
 FOCAL_35MM = 70.0  # mm

@@ -1,5 +1,5 @@
-"""The evidence for the appearance part of a prior: every measurement of `appearance_prior`, cached, and short trainings
-without single loss terms."""
+"""Measures the appearance part of a prior on unseen heads, and short AF-SM trainings without single loss terms. Results
+are kept on disk."""
 
 import dataclasses
 import json
@@ -19,11 +19,11 @@ from sira_mi.training.loop import trained_parameters
 from sira_mi.training.prior import whitening
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.train import APPEARANCE_TERMS, train_appearance
-from studies.cache import cached, fingerprint, read
-from studies.priors import appearance_prior as measures_of
-from studies.priors.ablations import COMPLETE, read_model, seconds, training_scenes
-from studies.priors.appearance_prior import HeldOut, LatentFit
-from studies.priors.shape_prior import manifest_entries
+from studies.cache import fingerprint, load_or_compute, read
+from studies.priors import appearance_measures as measures_of
+from studies.priors.appearance_measures import HeldOut, LatentFit
+from studies.priors.shape_measures import manifest_entries
+from studies.priors.short_trainings import COMPLETE, read_model, seconds, training_scenes
 
 _VERSION = "1"
 _BASELINE_SCENES = 64  # training scenes whose mean albedo is a baseline
@@ -61,7 +61,7 @@ def measure_appearance_prior(collection: Path, runs: Path, measures: AppearanceM
         scores = score_prior(prior, collection, held_out, scenes, z_sdf, measures.fit)
         imaged = _spread(len(held_out), measures.imaged)
         views = {
-            k: measures_of.fitted_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k]) for k in imaged
+            k: measures_of.render_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k]) for k in imaged
         }
         images = [measures_of.image_scores(views[k], held_out[k], scores["baseline"]) for k in imaged]
         shown = [imaged[k] for k in _spread(len(imaged), measures.pictured)]
@@ -78,7 +78,7 @@ def measure_appearance_prior(collection: Path, runs: Path, measures: AppearanceM
             "seconds": round(monotonic() - start, 1),
         }
 
-    return cached(evidence / "appearance.json", key, result, (picture,))
+    return load_or_compute(evidence / "appearance.json", key, result, (picture,))
 
 
 def score_prior(
@@ -127,7 +127,7 @@ def _ablation(collection: Path, runs: Path, without: str | None, steps: int, sca
         return {"name": name, "steps": steps, "scans": len(held_out), **scores, "seconds": seconds(run, "appearance")}
 
     key = fingerprint(_VERSION, run / "prior.safetensors", collection / "manifest.json", str(scans))
-    return cached(folder / f"{name}_{steps}.json", key, result)
+    return load_or_compute(folder / f"{name}_{steps}.json", key, result)
 
 
 def _test_scans(collection: Path, evidence: Path, limit: int) -> tuple[list[HeldOut], list[TrainingScene], np.ndarray]:

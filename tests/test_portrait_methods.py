@@ -13,9 +13,10 @@ from sira_mi.avatar.file import PRIOR
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, SHADING
 from sira_mi.optimisation.adam import read_arrays
-from studies.portraits import fits, results_page, run_methods
+from studies.portraits import compare_methods, page, run_fit
+from studies.portraits.fit_job import Job
 from studies.portraits.methods import BY_NAME, METHODS
-from studies.portraits.run_methods import Job, run
+from studies.portraits.run_fit import run
 
 DRAFT = QUALITIES["draft"]
 
@@ -110,7 +111,7 @@ def test_a_fit_is_done_once_and_again_when_what_it_depends_on_changes(jobs, monk
 
         join = start
 
-    monkeypatch.setattr(run_methods.multiprocessing, "get_context", lambda kind: type("C", (), {"Process": Process}))
+    monkeypatch.setattr(run_fit.multiprocessing, "get_context", lambda kind: type("C", (), {"Process": Process}))
     for job, result in jobs:
         assert run(job) == result
     assert started == []
@@ -130,13 +131,13 @@ def test_a_photo_without_a_face_is_a_result_that_says_so(tmp_path):
 
 def rows() -> list[dict]:
     """Made-up rows of two portraits; scores grow with the portrait."""
-    names = {c.score for c in results_page.GEOMETRY_COLUMNS + results_page.APPEARANCE_COLUMNS}
+    names = {c.score for c in page.GEOMETRY_COLUMNS + page.APPEARANCE_COLUMNS}
     result = []
     for k, light in enumerate(("studio", "extreme")):
-        for j, method in enumerate((fits.MEAN_HEAD, "a.3", "a.4", "b.3")):
+        for j, method in enumerate((compare_methods.MEAN_HEAD, "a.3", "a.4", "b.3")):
             scores = {name: 2.0 - 0.4 * j + 0.1 * k for name in names}
             row = {"portrait": f"p{k}", "identity": f"i{k}", "light": light, "method": method, "scores": scores}
-            if method != fits.MEAN_HEAD:
+            if method != compare_methods.MEAN_HEAD:
                 row |= {"seconds": {"latents": 10.0 + k}, "total_seconds": 20.0 + k, "peak_memory_megabytes": 900 + k}
             result.append(row)
     return result
@@ -144,24 +145,24 @@ def rows() -> list[dict]:
 
 def test_results_page_says_what_is_reached_and_what_is_missed(tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
-    monkeypatch.setattr(results_page, "picture", lambda *arguments: np.zeros((4, 4, 3)))
+    monkeypatch.setattr(page, "picture", lambda *arguments: np.zeros((4, 4, 3)))
     failed = {"portrait": "p2", "identity": "i2", "light": "studio", "method": "a.3", "error": "no face found"}
-    described = results_page.Described(tmp_path, tmp_path, "standard", "draft")
-    page = results_page.write_results(rows(), [*rows(), failed], described, tmp_path).read_text()
-    assert "| face, both directions, mm | ≤ 1 | 0.85 | reached |" in page
-    assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in page
-    assert "| final render, dB | ≥ 34 | 0.8 | **missed** by 33.1 |" in page
-    assert "| a.4 minus the best of a.1 to a.3, mm | ≤ 0 | – | – |" in page
-    assert "| time of a fit, s | ≤ 300 | 41 | reached |" in page
-    assert "| p2 | a.3 | no face found |" in page
+    described = page.Described(tmp_path, tmp_path, "standard", "draft")
+    text = page.write_results(rows(), [*rows(), failed], described, tmp_path).read_text()
+    assert "| face, both directions, mm | ≤ 1 | 0.85 | reached |" in text
+    assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in text
+    assert "| final render, dB | ≥ 34 | 0.8 | **missed** by 33.1 |" in text
+    assert "| a.4 minus the best of a.1 to a.3, mm | ≤ 0 | – | – |" in text
+    assert "| time of a fit, s | ≤ 300 | 41 | reached |" in text
+    assert "| p2 | a.3 | no face found |" in text
     assert (tmp_path / "images" / "results.png").exists()
 
 
 def test_unknown_methods_and_portraits_are_named(tmp_path):
     (tmp_path / "benchmark.json").write_text(json.dumps({"format": "sira-mi benchmark 1", "portraits": []}))
     with pytest.raises(InputError, match=r"unknown methods c\.1; known are a\.1"):
-        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("c.1",)))
+        compare_methods.compare(compare_methods.Comparison(tmp_path, tmp_path, methods=("c.1",)))
     with pytest.raises(InputError, match="prior-without-deformation"):
-        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("a.1",)))
+        compare_methods.compare(compare_methods.Comparison(tmp_path, tmp_path, methods=("a.1",)))
     with pytest.raises(InputError, match="no such portraits"):
-        fits.compare(fits.Comparison(tmp_path, tmp_path, methods=("a.4",)))
+        compare_methods.compare(compare_methods.Comparison(tmp_path, tmp_path, methods=("a.4",)))

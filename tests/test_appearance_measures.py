@@ -20,7 +20,7 @@ from sira_mi.sg.radiance import Material, radiance_of_scenes, reflected_radiance
 from sira_mi.training import af_sm
 from sira_mi.training.prior import assemble_prior
 from sira_mi.training.scenes import TrainingScene
-from studies.priors import appearance_prior as ap
+from studies.priors import appearance_measures as ap
 
 SETTINGS = af_sm.AppearanceTraining(frozen_points=400)
 
@@ -44,7 +44,7 @@ def test_psnr_is_that_of_a_known_error():
 def test_scaling_takes_out_a_tint_and_nothing_else():
     truth = np.abs(random(500, 3)) * 0.2 + 0.1
     tinted = truth * [0.5, 0.8, 1.3]
-    np.testing.assert_allclose(ap.channel_scaled(tinted, truth), truth, rtol=1e-6)
+    np.testing.assert_allclose(ap.scale_channels(tinted, truth), truth, rtol=1e-6)
     scores = ap.albedo_scores(tinted, truth)
     assert scores["psnr_scaled"] > 100 > 40 > scores["psnr"]
     assert ap.albedo_scores(truth + 0.1 * random(500, 3), truth)["psnr_scaled"] < 25
@@ -328,7 +328,7 @@ def test_images_of_the_fitted_head(model, scene, true_latents):
     assert len(pixel) > 100
     np.testing.assert_allclose(pixel, expected, atol=1e-3)
 
-    (view,) = ap.fitted_views(model, true_latents, z_sdf, held, voxel=0.15)
+    (view,) = ap.render_views(model, true_latents, z_sdf, held, voxel=0.15)
     assert view.hit.sum() == len(pixel)
     inputs = ap.surface_inputs(model, z_sdf, found["points"])
     direct = ap.factors(model, true_latents, inputs, found["directions"].T)

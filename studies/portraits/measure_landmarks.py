@@ -63,7 +63,7 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
     return found, blind
 
 
-def fitted_correction(observations: list[Observation]) -> LandmarkCorrection:
+def fit_correction(observations: list[Observation]) -> LandmarkCorrection:
     """Least squares of the offsets by the polynomial of the direction. Landmarks that a head does not know count as the
     mean of the others'."""
     mean = _mean_face(observations)
@@ -87,7 +87,7 @@ def _mean_face(observations: list[Observation]) -> np.ndarray:
     return mean
 
 
-def held_out_errors(observations: list[Observation]) -> tuple[float, float]:
+def measure_held_out_errors(observations: list[Observation]) -> tuple[float, float]:
     """Mean distance of found and of corrected landmarks to the true ones, in face sizes, each head by what the others
     tell. Raises InputError for too few heads."""
     heads = sorted({o.head for o in observations})
@@ -96,7 +96,7 @@ def held_out_errors(observations: list[Observation]) -> tuple[float, float]:
     fold = {head: k % _FOLDS for k, head in enumerate(heads)}
     found, corrected = [], []
     for k in range(_FOLDS):
-        correction = fitted_correction([o for o in observations if fold[o.head] != k])
+        correction = fit_correction([o for o in observations if fold[o.head] != k])
         for o in observations:
             if fold[o.head] == k:
                 found.append(_distance(o, o.face.landmarks))

@@ -8,8 +8,8 @@ from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fit.skin import Eye, SkinCues
 from studies.portraits import __main__ as command
-from studies.portraits import skin_level
-from studies.portraits.skin_level import Observation, estimate, true_luminance
+from studies.portraits import measure_skin
+from studies.portraits.measure_skin import Observation, estimate, true_luminance
 
 
 def observations(noise: float, heads: int = 40, lights: int = 3, misleading: float = 0.2) -> list[Observation]:
@@ -60,11 +60,11 @@ def test_the_command_prints_the_constants_of_the_fit(monkeypatch, capsys, tmp_pa
     monkeypatch.setattr("sys.argv", ["evaluate", "skin", "--benchmark", str(tmp_path)])
     with pytest.raises(InputError, match="no benchmark"):
         command.main()
-    monkeypatch.setattr(skin_level, "observe", lambda folder: (observations(0.1), ["blind"]))
+    monkeypatch.setattr(measure_skin, "observe", lambda folder: (observations(0.1), ["blind"]))
     command.main()
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("120 portraits") and lines[0].endswith("unseen: 1")
     assert lines[1].startswith("by skin: error 0.4") and lines[2].startswith("usual -1.")
-    monkeypatch.setattr(skin_level, "observe", lambda folder: ([], ["blind"]))
+    monkeypatch.setattr(measure_skin, "observe", lambda folder: ([], ["blind"]))
     with pytest.raises(InputError, match="0 portraits of 0 heads"):
         command.main()

@@ -29,6 +29,7 @@ from sira_mi.fields.sdf import evaluate_in_chunks, surface
 from sira_mi.optimisation.adam import adam, parameter_values
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.relight.pictures import psnr
 from sira_mi.sg.radiance import Material, reflect, reflected_radiance
 from sira_mi.sg.shading import shade
 from sira_mi.training import af_sm
@@ -37,10 +38,9 @@ from sira_mi.training.scenes import TrainingScene
 from studies.measures import (
     F0_OF_STRENGTH,
     FACE_RADIUS,
-    channel_scaled,
     leakage,
     luminance,
-    psnr,
+    scale_channels,
     ssim_inside,
 )
 
@@ -220,7 +220,7 @@ def albedo_scores(values: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     return {
         "psnr": psnr(values, truth),
         "psnr_srgb": psnr(linear_to_srgb(values), linear_to_srgb(truth)),
-        "psnr_scaled": psnr(channel_scaled(values, truth), truth),
+        "psnr_scaled": psnr(scale_channels(values, truth), truth),
     }
 
 
@@ -338,7 +338,7 @@ def primary_hits(
     return result
 
 
-def fitted_views(
+def render_views(
     avatar: Avatar, latents: dict[str, np.ndarray], z_sdf: np.ndarray, scene: HeldOut, voxel: float = 0.1
 ) -> list[View]:
     """The head with `latents` and `z_sdf` in every held-out view of `scene`."""
@@ -396,7 +396,7 @@ def image_scores(views: Sequence[View], scene: HeldOut, baseline: Baseline) -> d
             for name, value in albedo_scores(albedo[inside], truth[inside]).items():
                 scores[f"{prefix}albedo_{name}"] = value
             scaled = np.zeros(albedo.shape)
-            scaled[inside] = channel_scaled(albedo[inside], truth[inside])
+            scaled[inside] = scale_channels(albedo[inside], truth[inside])
             for name, image in (("ssim", albedo), ("ssim_scaled", scaled)):
                 scores[f"{prefix}albedo_{name}"] = ssim_inside(linear_to_srgb(image), linear_to_srgb(truth), inside)
         flat = np.full(strength.shape, baseline.strength * F0_OF_STRENGTH)

@@ -94,22 +94,22 @@ def estimate(observations: list[Observation]) -> Estimate:
         left_out = [o for o, own in zip(observations, fold, strict=True) if own == k]
         if not left_out:
             continue
-        errors[fold == k] = _predicted(_fitted(other), left_out) - target[fold == k]
+        errors[fold == k] = _predict(_fit_level(other), left_out) - target[fold == k]
         line = np.polynomial.Polynomial.fit(*_by_radiance(other), 1)
         by_skin[fold == k] = line(_by_radiance(left_out)[0]) - target[fold == k]
     error, error_by_skin = (float(np.sqrt((e**2).mean())) for e in (errors, by_skin))
-    return Estimate(_fitted(observations), error, error_by_skin)
+    return Estimate(_fit_level(observations), error, error_by_skin)
 
 
 def _by_radiance(observations: list[Observation]) -> tuple[np.ndarray, np.ndarray]:
     return np.log([o.cues.radiance for o in observations]), np.log([o.luminance for o in observations])
 
 
-def _predicted(level: SkinLevel, observations: list[Observation]) -> np.ndarray:
+def _predict(level: SkinLevel, observations: list[Observation]) -> np.ndarray:
     return level.log_luminance(*cue_arrays([o.cues for o in observations]))
 
 
-def _fitted(observations: list[Observation]) -> SkinLevel:
+def _fit_level(observations: list[Observation]) -> SkinLevel:
     """Least squares with a weak pull to the start, which the few misleading eyes need; widths by their logarithms."""
     cues, target = cue_arrays([o.cues for o in observations]), np.log([o.luminance for o in observations])
 

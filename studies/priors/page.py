@@ -12,7 +12,7 @@ from sira_mi.avatar.file import AvatarArchitecture
 from sira_mi.files import write_through
 from studies.cache import read
 from studies.markdown import average, number, percent, table
-from studies.priors.shape_prior import DISC_RADIUS, REGIONS
+from studies.priors.shape_measures import DISC_RADIUS, REGIONS
 
 COMMANDS = """    python -m sira_mi.training shape --collection COLLECTION --out RUNS
     python -m sira_mi.training appearance --collection COLLECTION --out RUNS

@@ -1,4 +1,4 @@
-"""The evidence for the shape part of a prior: every measurement of `shape_prior`, cached, with its pictures."""
+"""Measures the shape part of a prior on unseen heads and draws the pictures. Results are kept on disk."""
 
 import json
 from collections import Counter
@@ -15,10 +15,10 @@ from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_png
 from sira_mi.training.pictures import extracted_surface, head_tile, scan_tile, sheet
 from sira_mi.training.shape_model import ShapeModel
-from studies.cache import cached, fingerprint
-from studies.priors import shape_prior
-from studies.priors.ablations import mean_nose, read_model, seconds
-from studies.priors.shape_prior import Scan, ShapeFit
+from studies.cache import fingerprint, load_or_compute
+from studies.priors import shape_measures
+from studies.priors.shape_measures import Scan, ShapeFit
+from studies.priors.short_trainings import mean_nose, read_model, seconds
 
 _VERSION = "1"
 _PICTURED = 8  # scans in the picture of fits
@@ -46,7 +46,7 @@ def measure_shape_prior(collection: Path, runs: Path, measures: Measures | None 
     evidence.mkdir(exist_ok=True)
     prior = ShapeModel.of_prior(load_avatar(runs / "prior.safetensors"))
     trained, parameters = read_model(runs / "shape.checkpoint")
-    shape_prior.manifest_entries(collection, "test")
+    shape_measures.manifest_entries(collection, "test")
     key = fingerprint(
         _VERSION, manifest, runs / "shape.checkpoint", runs / "prior.safetensors", json.dumps(asdict(measures))
     )
@@ -57,11 +57,11 @@ def measure_shape_prior(collection: Path, runs: Path, measures: Measures | None 
         def timed() -> dict:
             return {**compute(), "seconds": round(monotonic() - start, 1)}
 
-        return cached(evidence / f"{name}.json", key, timed, tuple(evidence / picture for picture in pictures))
+        return load_or_compute(evidence / f"{name}.json", key, timed, tuple(evidence / picture for picture in pictures))
 
     part("collection", lambda: _collection(collection))
     part("training", lambda: _training(runs, parameters))
-    scans = shape_prior.load_scans(collection, mean_nose(collection), measures.scans)
+    scans = shape_measures.load_scans(collection, mean_nose(collection), measures.scans)
     fits = part("fits", lambda: _fits(prior, scans, measures, evidence / "prior_fits.png"), "prior_fits.png")
     part("heads", lambda: _heads(prior, measures.heads, evidence), "prior_samples_1.png", "prior_samples_2.png")
     part("directions", lambda: _directions(trained, evidence / "prior_directions.png"), "prior_directions.png")
@@ -72,7 +72,7 @@ def _collection(collection: Path) -> dict:
     """Counts of scenes by split and trait."""
     result = {}
     for split in ("train", "test"):
-        entries = shape_prior.manifest_entries(collection, split)
+        entries = shape_measures.manifest_entries(collection, split)
         result[split] = len(entries)
         result[f"{split}_sources"] = dict(Counter(str(entry.get("source", "makehuman")) for entry in entries))
     return result
@@ -90,7 +90,7 @@ def _training(runs: Path, parameters: dict[str, np.ndarray]) -> dict:
 
 def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Path) -> dict:
     start = monotonic()
-    w = shape_prior.fit_shape(model, [scan.scene for scan in scans], measures.fit)
+    w = shape_measures.fit_shape(model, [scan.scene for scan in scans], measures.fit)
     fitting = monotonic() - start
     zero = model.field(model.latent("z_sdf", 0 * w[:, 0]))
     zero_points = _surface_points(zero, measures.points)
@@ -100,17 +100,17 @@ def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Pat
         row = {"name": scan.name, "traits": scan.traits, "rms_w": float(np.sqrt(np.mean(w[:, k] ** 2)))}
         points = _surface_points(fitted, measures.points)
         for name, head, on_surface in (("fitted", fitted, points), ("mean_head", zero, zero_points)):
-            errors = shape_prior.scan_errors(head, scan, measures.points)
-            row[name] = {**errors, "to_scan": shape_prior.surface_errors(on_surface, scan)}
+            errors = shape_measures.scan_errors(head, scan, measures.points)
+            row[name] = {**errors, "to_scan": shape_measures.surface_errors(on_surface, scan)}
         rows.append(row)
         if len(tiles) < _PICTURED:
             tiles.append((scan_tile(scan.scene.points, scan.scene.normals), head_tile(fitted)))
     write_png(picture, sheet([[tile[0] for tile in tiles], [tile[1] for tile in tiles]]))
-    colors = shape_prior.color_errors(model, scans, w, measures.color_steps)
+    colors = shape_measures.color_errors(model, scans, w, measures.color_steps)
     return {
         "fit": asdict(measures.fit),
         "points": measures.points,
-        "spacing": float(np.median([shape_prior.spacing(scan.scene.points) for scan in scans])),
+        "spacing": float(np.median([shape_measures.spacing(scan.scene.points) for scan in scans])),
         "fitting_seconds": round(fitting, 1),
         "color": float(np.mean(colors)),
         "scans": rows,
@@ -121,7 +121,7 @@ def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Pat
 def _surface_points(field, count: int) -> np.ndarray:
     """Points [count, 3] on a field's surface above the shoulders; none where there is no surface."""
     try:
-        return shape_prior.surface_samples(field, extracted_surface(field, shape_prior.VOXEL), count)
+        return shape_measures.surface_samples(field, extracted_surface(field, shape_measures.VOXEL), count)
     except EmptySurfaceError:
         return np.zeros((0, 3), np.float32)
 
@@ -129,7 +129,7 @@ def _surface_points(field, count: int) -> np.ndarray:
 def _heads(model: ShapeModel, count: int, evidence: Path) -> dict:
     result = {}
     for sigma in (1, 2):
-        rows, tiles = shape_prior.random_heads(model, float(sigma), count, seed=sigma)
+        rows, tiles = shape_measures.random_heads(model, float(sigma), count, seed=sigma)
         write_png(evidence / f"prior_samples_{sigma}.png", sheet([tiles[k : k + 8] for k in range(0, count, 8)]))
         result[str(sigma)] = rows
     return result
@@ -158,10 +158,10 @@ def _landmarks(
     collection: Path,
 ) -> dict:
     latents = np.stack([prior.latent("z_sdf", w[:, k]) for k in range(len(scans))], axis=1)
-    training = shape_prior.load_landmarks(collection)
+    training = shape_measures.load_landmarks(collection)
     if len(training) != parameters["z_sdf"].shape[1]:
         raise InputError(f"{collection} has {len(training)} training scenes, the run {parameters['z_sdf'].shape[1]}")
     return {
-        "test": shape_prior.landmark_spread(prior, latents, np.stack([scan.scene.landmarks for scan in scans])),
-        "train": shape_prior.landmark_spread(trained, parameters["z_sdf"], training),
+        "test": shape_measures.landmark_spread(prior, latents, np.stack([scan.scene.landmarks for scan in scans])),
+        "train": shape_measures.landmark_spread(trained, parameters["z_sdf"], training),
     }

@@ -1,6 +1,5 @@
 """The benchmark's portraits, fitted by every method and scored against the truth: rows for the results page."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,16 +11,16 @@ from tqdm import tqdm
 
 from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.errors import InputError
-from sira_mi.files import write_through
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
-from studies.cache import cached, fingerprint
+from studies.cache import fingerprint, load_or_compute
 from studies.portraits.appearance_scores import PredictedAppearance, score_appearance
 from studies.portraits.benchmark import read_benchmark
+from studies.portraits.fit_job import Job
 from studies.portraits.geometry_scores import PredictedHead, score_geometry, true_surface
 from studies.portraits.methods import BY_NAME, METHODS
-from studies.portraits.run_methods import Job, run
+from studies.portraits.run_fit import run
 from studies.portraits.truth import Truth, load_truth
 
 MEAN_HEAD = "mean head"
@@ -92,7 +91,7 @@ def _portrait_rows(comparison: Comparison, entry: dict, methods: list[str]):
             scores = score_geometry(geometry, truth, surface)
             return scores if appearance is None else scores | score_appearance(appearance, truth)
 
-        return cached(path, fingerprint(_VERSION, key, folder / "truth.npz"), compute)
+        return load_or_compute(path, fingerprint(_VERSION, key, folder / "truth.npz"), compute)
 
     described = {"portrait": entry["name"], "identity": entry["identity"], "light": entry["light"]}
     mean = comparison.runs / entry["name"] / "mean_head.json"
@@ -140,9 +139,3 @@ def _read_head(out: Path, shaded: bool, truth: Truth) -> tuple[PredictedHead, Pr
     names = ("final", "diffuse_albedo", "specular_albedo", "mask")
     shaded = image["diffuse"] + image["specular"]
     return head, PredictedAppearance(**{name: image[name] for name in names}, shaded=shaded)
-
-
-def write_rows(path: Path, rows: list[dict]) -> None:
-    """The rows as JSON, for the page and for other tools."""
-    text = json.dumps(rows, indent=1) + "\n"
-    write_through(path, lambda file: file.write_text(text, encoding="utf-8"))

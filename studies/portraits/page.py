@@ -1,4 +1,4 @@
-"""`docs/results.md` from the rows of `fits.compare`: marks, ablations, lights, portraits, pictures."""
+"""`docs/results.md` from the rows of `compare_methods.compare`: marks, ablations, lights, portraits, pictures."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from sira_mi.files import write_png, write_through
 from sira_mi.relight.pictures import preview
 from studies.markdown import number, table
 from studies.portraits import results_text
-from studies.portraits.fits import MEAN_HEAD
+from studies.portraits.compare_methods import MEAN_HEAD
 from studies.portraits.methods import BY_NAME
 
 SHIPPED = "b.3"

@@ -19,11 +19,11 @@ from sira_mi.training import pictures, train
 from sira_mi.training.pictures import extracted_surface
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
-from studies.cache import cached, fingerprint, read
+from studies.cache import fingerprint, load_or_compute, read
 from studies.priors import __main__ as command
-from studies.priors import ablations, appearance_evidence, prior_page, shape_evidence, shape_prior
-from studies.priors.appearance_prior import LatentFit
-from studies.priors.shape_prior import Scan, ShapeFit
+from studies.priors import measure_appearance, measure_shape, page, shape_measures, short_trainings
+from studies.priors.appearance_measures import LatentFit
+from studies.priors.shape_measures import Scan, ShapeFit
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def scan_of(model, w, w_r, seed: int) -> Scan:
     """A scan of the model's own head `w`, in the model's own colours `w_r`, from one camera."""
     rng = np.random.default_rng(seed)
     field = model.field(model.latent("z_sdf", w))
-    points = shape_prior.surface_samples(field, extracted_surface(field), 3000, seed)
+    points = shape_measures.surface_samples(field, extracted_surface(field), 3000, seed)
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x: surface(field, x), points.T)
     normals = gradient / np.linalg.norm(gradient, axis=0)
     centre = np.float32([[0, 0, 8]])
@@ -76,15 +76,15 @@ def own(model):
 def test_distance_to_the_surface_is_the_offset_from_it(model):
     """Points moved off the surface along its normals by up to 2 mm are as far from it as they were moved."""
     field = model.field(model.latent("z_sdf", np.zeros(SMALL.sdf_latent)))
-    on = shape_prior.surface_samples(field, extracted_surface(field), 500)
+    on = shape_measures.surface_samples(field, extracted_surface(field), 500)
     f, gradient = evaluate_in_chunks(lambda x: surface(field, x)[:2], on.T)
     normals = (gradient / np.linalg.norm(gradient, axis=0)).T
     assert np.abs(f).max() < 2e-3
     offset = np.random.default_rng(0).uniform(-2, 2, (500, 1))
-    distance, angle = shape_prior.to_surface(field, on + normals * offset / 100, normals)
+    distance, angle = shape_measures.to_surface(field, on + normals * offset / 100, normals)
     np.testing.assert_allclose(distance, np.abs(offset[:, 0]), atol=0.25)
     assert np.median(np.abs(distance - np.abs(offset[:, 0]))) < 0.05 and np.median(angle) < 3
-    _, opposite = shape_prior.to_surface(field, on, -normals)
+    _, opposite = shape_measures.to_surface(field, on, -normals)
     assert opposite.min() > 179
 
 
@@ -95,10 +95,10 @@ def test_distance_to_a_scan_is_that_to_its_discs():
     points = np.stack([x, 0 * x, z], axis=1)
     scan = plate(points)
     above = np.array([[0.011, 0.3, 0.007], [0.1, -0.25, -0.2]])
-    np.testing.assert_allclose(shape_prior.to_scan(above, scan)[0], [30, 25], rtol=1e-6)
+    np.testing.assert_allclose(shape_measures.to_scan(above, scan)[0], [30, 25], rtol=1e-6)
     beside = np.array([[0.6, 0.0, 0.0], [0.6, 0.1, 0.0], [0.41, 0.0, 0.0]])
-    np.testing.assert_allclose(shape_prior.to_scan(beside, scan)[0], [17, np.hypot(17, 10), 0], atol=1e-6)
-    assert shape_prior.spacing(points) == pytest.approx(2)
+    np.testing.assert_allclose(shape_measures.to_scan(beside, scan)[0], [17, np.hypot(17, 10), 0], atol=1e-6)
+    assert shape_measures.spacing(points) == pytest.approx(2)
 
 
 def plate(points) -> Scan:
@@ -123,11 +123,11 @@ def test_surface_samples_are_even_and_on_the_surface(model):
     """On each side of the blob as many as its share of the area."""
     field = model.field(model.latent("z_sdf", np.zeros(SMALL.sdf_latent)))
     extracted = extracted_surface(field)
-    points = shape_prior.surface_samples(field, extracted, 4000)
+    points = shape_measures.surface_samples(field, extracted, 4000)
     (f,) = evaluate_in_chunks(lambda x: signed_distance(field, x), points.T)
     assert np.abs(f).max() < 5e-3
     corners = extracted.vertices[extracted.faces.astype(int)]
-    corners = corners[corners[:, :, 1].min(axis=1) > shape_prior.SHOULDERS]
+    corners = corners[corners[:, :, 1].min(axis=1) > shape_measures.SHOULDERS]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     for axis in range(3):
         share = area[corners[:, :, axis].mean(axis=1) > 0].sum() / area.sum()
@@ -137,16 +137,16 @@ def test_surface_samples_are_even_and_on_the_surface(model):
 def test_regions_leave_out_shoulders_hair_and_what_is_far_from_the_nose():
     points = np.array([[0, 0, 1.0], [0, 0.9, 0.9], [0, -2.0, 0.5], [0, 0.3, -1.0]])
     hair = np.array([False, True, False, True])
-    regions = shape_prior.regions_of(points, hair, np.array([0, 0, 1.2]))
-    assert list(regions) == list(shape_prior.REGIONS)
+    regions = shape_measures.regions_of(points, hair, np.array([0, 0, 1.2]))
+    assert list(regions) == list(shape_measures.REGIONS)
     expected = [[1, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0], [1, 1, 0, 1]]
     for mask, row in zip(regions.values(), expected, strict=True):
         np.testing.assert_array_equal(mask, np.array(row, bool))
 
 
 def test_statistics_of_a_region():
-    assert shape_prior.statistics(np.arange(101.0)) == {"mean": 50.0, "median": 50.0, "p90": 90.0}
-    assert np.isnan(list(shape_prior.statistics(np.zeros(0)).values())).all()
+    assert shape_measures.statistics(np.arange(101.0)) == {"mean": 50.0, "median": 50.0, "p90": 90.0}
+    assert np.isnan(list(shape_measures.statistics(np.zeros(0)).values())).all()
 
 
 @pytest.mark.parametrize(("centres", "parts"), [([0.0], 1), ([-1.2, 1.2], 2), ([-0.5, 0.5], 1)])
@@ -154,7 +154,7 @@ def test_components_of_a_mesh(centres, parts):
     def balls(p):
         return np.min([np.linalg.norm(p - np.array([[c], [0], [0]]), axis=0) - 0.8 for c in centres], axis=0)
 
-    count, largest = shape_prior.components(extract(balls, 0.1))
+    count, largest = shape_measures.components(extract(balls, 0.1))
     assert count == parts and largest == pytest.approx(1 / parts, abs=0.02)
 
 
@@ -163,27 +163,28 @@ def test_components_of_a_mesh(centres, parts):
 
 def test_a_fit_recovers_the_models_own_heads(model, own):
     scans, _ = own
-    w = shape_prior.fit_shape(model, [scan.scene for scan in scans], ShapeFit(steps=200))
+    w = shape_measures.fit_shape(model, [scan.scene for scan in scans], ShapeFit(steps=200))
     errors = {}
     for name, latents in (("fitted", w), ("mean", 0 * w)):
         fields = [model.field(model.latent("z_sdf", latents[:, k])) for k in range(3)]
         errors[name] = [
-            shape_prior.scan_errors(field, scan, 500)["distance"]["head with hair"]["mean"]
+            shape_measures.scan_errors(field, scan, 500)["distance"]["head with hair"]["mean"]
             for field, scan in zip(fields, scans, strict=True)
         ]
     assert np.max(np.array(errors["fitted"]) / errors["mean"]) < 0.2, errors
 
 
 def test_a_fit_repeats_bit_for_bit(model, own):
-    fits = [shape_prior.fit_shape(model, [scan.scene for scan in own[0]], ShapeFit(steps=5), seed=3) for _ in range(2)]
+    scenes = [scan.scene for scan in own[0]]
+    fits = [shape_measures.fit_shape(model, scenes, ShapeFit(steps=5), seed=3) for _ in range(2)]
     np.testing.assert_array_equal(*fits)
     assert np.abs(fits[0]).max() > 0
 
 
 def test_colours_are_fitted_on_one_half_and_measured_on_the_other(model, own):
     scans, w = own
-    before = shape_prior.color_errors(model, scans, w, steps=0)
-    after = shape_prior.color_errors(model, scans, w, steps=60)
+    before = shape_measures.color_errors(model, scans, w, steps=0)
+    after = shape_measures.color_errors(model, scans, w, steps=60)
     assert len(after) == 3 and np.mean(after) < 0.4 * np.mean(before), (before, after)
     assert (np.array(after) < before).all()
 
@@ -205,11 +206,11 @@ def test_landmark_spread_is_the_root_mean_square_over_heads(model):
     still = dataclasses.replace(
         model, networks={**model.networks, "deformation": np.zeros_like(model.networks["deformation"])}
     )
-    result = shape_prior.landmark_spread(still, np.zeros((SMALL.sdf_latent, 4)), landmarks)
+    result = shape_measures.landmark_spread(still, np.zeros((SMALL.sdf_latent, 4)), landmarks)
     assert result["undeformed"] == pytest.approx(100 * np.mean(expected), rel=1e-5)
     assert result["deformed"] == pytest.approx(result["undeformed"], rel=1e-5)
     assert result["scale"] == pytest.approx(1, rel=1e-5) and result["scenes"] == 4
-    moved = shape_prior.landmark_spread(model, rng.standard_normal((SMALL.sdf_latent, 4)), landmarks)
+    moved = shape_measures.landmark_spread(model, rng.standard_normal((SMALL.sdf_latent, 4)), landmarks)
     assert moved["deformed"] != pytest.approx(moved["undeformed"], rel=1e-3)
 
 
@@ -225,25 +226,25 @@ def test_results_are_measured_again_only_when_something_changed(tmp_path):
         return {"calls": len(calls)}
 
     file, picture = tmp_path / "deep" / "a.json", (tmp_path / "picture",)
-    assert [cached(file, "k", compute, picture)["calls"] for _ in range(2)] == [1, 1]
-    assert cached(file, "other", compute, picture)["calls"] == 2
+    assert [load_or_compute(file, "k", compute, picture)["calls"] for _ in range(2)] == [1, 1]
+    assert load_or_compute(file, "other", compute, picture)["calls"] == 2
     picture[0].unlink()
-    assert cached(file, "other", compute, picture)["calls"] == 3
+    assert load_or_compute(file, "other", compute, picture)["calls"] == 3
     for damaged in ("", "[]", '{"key": "other"}', '{"key": "other", "result": 3}'):
         file.write_text(damaged)
         assert read(file) is None
-    assert cached(file, "other", compute, picture)["calls"] == 4
+    assert load_or_compute(file, "other", compute, picture)["calls"] == 4
     assert fingerprint("ab", "c") != fingerprint("a", "bc")
     assert fingerprint(picture[0]) == fingerprint("x")
 
 
 def test_tables_keep_their_columns():
-    assert prior_page.table(["|∇f|", "b"], [["1", "2"]]) == "| \\|∇f\\| | b |\n| --- | --- |\n| 1 | 2 |"
+    assert page.table(["|∇f|", "b"], [["1", "2"]]) == "| \\|∇f\\| | b |\n| --- | --- |\n| 1 | 2 |"
 
 
 def test_a_page_without_measurements_says_which_command_makes_them(tmp_path):
-    text = prior_page.page(tmp_path)
-    assert text.count("Not measured yet") == len(prior_page.SECTIONS)
+    text = page.page(tmp_path)
+    assert text.count("Not measured yet") == len(page.SECTIONS)
 
 
 # The command
@@ -268,22 +269,24 @@ def balls(tmp_path_factory):
 
 
 FIT = ShapeFit(steps=20, points=32)
-MEASURES = shape_evidence.Measures(points=300, heads=2, fit=FIT, color_steps=5)
+MEASURES = measure_shape.Measures(points=300, heads=2, fit=FIT, color_steps=5)
 LATENT_FIT = LatentFit(steps=3, scenes=2, points=16)
-APPEARANCE_MEASURES = appearance_evidence.AppearanceMeasures(imaged=1, pictured=1, training_scenes=1, fit=LATENT_FIT)
-PROTOCOL = ablations.Protocol(scans=1, points=100, heads=1, cost_points=256, fit=FIT, color_steps=5)
+APPEARANCE_MEASURES = measure_appearance.AppearanceMeasures(imaged=1, pictured=1, training_scenes=1, fit=LATENT_FIT)
+PROTOCOL = short_trainings.Protocol(scans=1, points=100, heads=1, cost_points=256, fit=FIT, color_steps=5)
 
 
 def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_path, monkeypatch):
     collection, runs = balls
-    monkeypatch.setattr(shape_evidence, "Measures", lambda: MEASURES)
-    monkeypatch.setattr(ablations, "Protocol", lambda: PROTOCOL)
-    monkeypatch.setattr(ablations, "SHAPE_TERMS", ("eikonal",))
-    monkeypatch.setattr(appearance_evidence, "AppearanceMeasures", lambda: APPEARANCE_MEASURES)
-    monkeypatch.setattr(appearance_evidence, "LatentFit", lambda: LATENT_FIT)
-    monkeypatch.setattr(appearance_evidence, "APPEARANCE_TERMS", ("smoothness",))
-    monkeypatch.setattr(ablations, "architectures", lambda: {"complete": SIZES, "small": {**SIZES, "features": 2}})
-    for name, option in (("sizes", "--steps"), ("prior", "--ablation-steps")):
+    monkeypatch.setattr(measure_shape, "Measures", lambda: MEASURES)
+    monkeypatch.setattr(short_trainings, "Protocol", lambda: PROTOCOL)
+    monkeypatch.setattr(short_trainings, "SHAPE_TERMS", ("eikonal",))
+    monkeypatch.setattr(measure_appearance, "AppearanceMeasures", lambda: APPEARANCE_MEASURES)
+    monkeypatch.setattr(measure_appearance, "LatentFit", lambda: LATENT_FIT)
+    monkeypatch.setattr(measure_appearance, "APPEARANCE_TERMS", ("smoothness",))
+    monkeypatch.setattr(
+        short_trainings, "architectures", lambda: {"complete": SIZES, "small": {**SIZES, "features": 2}}
+    )
+    for name, option in (("sizes", "--steps"), ("measure", "--ablation-steps")):
         arguments = [name, "--collection", str(collection), "--runs", str(runs), "--out", str(tmp_path), option, "2"]
         monkeypatch.setattr(sys, "argv", ["evaluate", *arguments])
         command.main()
@@ -311,7 +314,7 @@ def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_pa
         raise AssertionError("measured again")
 
     for name in ("fit_shape", "random_heads", "landmark_spread", "scan_errors"):
-        monkeypatch.setattr(shape_prior, name, again)
+        monkeypatch.setattr(shape_measures, name, again)
     command.main()
     assert (tmp_path / "priors.md").read_text() == text
 
@@ -328,16 +331,16 @@ def test_the_reference_of_the_ablations_differs_from_them(balls, coarse):
 
 def test_missing_files_are_named(balls, tmp_path):
     collection, runs = balls
-    with pytest.raises(InputError, match=r"shape\.checkpoint is missing; run python -m sira_mi\.train shape"):
-        shape_evidence.measure_shape_prior(collection, tmp_path, MEASURES)
+    with pytest.raises(InputError, match=r"shape\.checkpoint is missing; run python -m sira_mi\.training shape"):
+        measure_shape.measure_shape_prior(collection, tmp_path, MEASURES)
     with pytest.raises(InputError, match="not a collection"):
-        shape_evidence.measure_shape_prior(tmp_path, runs, MEASURES)
+        measure_shape.measure_shape_prior(tmp_path, runs, MEASURES)
     (tmp_path / "manifest.json").write_text('{"scenes": [{"file": "a", "split": "test", "error": "broken"}]}')
     with pytest.raises(InputError, match="no test scenes"):
-        shape_prior.load_scans(tmp_path, np.zeros(3))
+        shape_measures.load_scans(tmp_path, np.zeros(3))
 
 
 def test_every_size_of_the_table_is_one_of_the_architecture():
-    names = ablations.architectures()
-    assert names[ablations.COMPLETE] == {} and all(len(sizes) == 1 for name, sizes in list(names.items())[1:])
-    assert {next(iter(sizes)) for sizes in list(names.values())[1:]} == set(ablations.SIZES)
+    names = short_trainings.architectures()
+    assert names[short_trainings.COMPLETE] == {} and all(len(sizes) == 1 for name, sizes in list(names.items())[1:])
+    assert {next(iter(sizes)) for sizes in list(names.values())[1:]} == set(short_trainings.SIZES)

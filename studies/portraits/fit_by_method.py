@@ -24,8 +24,8 @@ from sira_mi.fit.shaded import seen_points
 from sira_mi.optimisation.adam import read_arrays, write_arrays
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
+from studies.portraits.fit_job import Job
 from studies.portraits.methods import BY_NAME, Method
-from studies.portraits.run_methods import Job
 
 
 def fit_and_write(job: Job) -> dict:

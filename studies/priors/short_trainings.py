@@ -24,9 +24,9 @@ from sira_mi.training.loop import trained_parameters
 from sira_mi.training.scenes import TrainingScene, load_training_scenes
 from sira_mi.training.shape_model import ShapeModel
 from sira_mi.training.train import SHAPE_TERMS, read_architecture, train_shape
-from studies.cache import cached, fingerprint
-from studies.priors import shape_prior
-from studies.priors.shape_prior import Scan, ShapeFit
+from studies.cache import fingerprint, load_or_compute
+from studies.priors import shape_measures
+from studies.priors.shape_measures import Scan, ShapeFit
 
 COMPLETE = "complete"
 _VERSION = "1"
@@ -77,14 +77,14 @@ def ablation(collection: Path, evidence: Path, without: str | None, steps: int, 
     name = COMPLETE if without is None else f"without_{without}"
 
     def measure(model: ShapeModel, scans: list[Scan]) -> dict:
-        w = shape_prior.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
+        w = shape_measures.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
         latents = np.stack([model.latent("z_sdf", w[:, k]) for k in range(len(scans))], axis=1)
-        rows, _ = shape_prior.random_heads(model, 1.0, protocol.heads)
+        rows, _ = shape_measures.random_heads(model, 1.0, protocol.heads)
         landmarks = np.stack([scan.scene.landmarks for scan in scans])
         return {
             **fit_scores(model, scans, w, protocol.points),
-            "landmark": shape_prior.landmark_spread(model, latents, landmarks)["deformed"],
-            "color": float(np.mean(shape_prior.color_errors(model, scans, w, protocol.color_steps))),
+            "landmark": shape_measures.landmark_spread(model, latents, landmarks)["deformed"],
+            "color": float(np.mean(shape_measures.color_errors(model, scans, w, protocol.color_steps))),
             "gradient": float(np.mean([row["gradient"] for row in rows])),
             "connected": float(np.mean([row["parts"] == 1 for row in rows])),
             "sizes": {size: getattr(model.architecture, size) for size in SIZES},
@@ -98,7 +98,7 @@ def size(collection: Path, evidence: Path, name: str, sizes: dict[str, int], ste
     `parameters` of the field, and the cost of its evaluation, `forward` and `backward` (µs a point)."""
 
     def measure(model: ShapeModel, scans: list[Scan]) -> dict:
-        w = shape_prior.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
+        w = shape_measures.fit_shape(model, [scan.scene for scan in scans], protocol.fit)
         forward, backward = evaluation_cost(model, protocol.cost_points)
         return {
             **fit_scores(model, scans, w, protocol.points),
@@ -120,11 +120,11 @@ def _trained(collection: Path, folder: Path, name: str, steps: int, protocol: Pr
 
     def result() -> dict:
         model, _ = read_model(checkpoint)
-        scans = shape_prior.load_scans(collection, mean_nose(collection), protocol.scans)
+        scans = shape_measures.load_scans(collection, mean_nose(collection), protocol.scans)
         return {"name": name, "steps": steps, "scans": len(scans), **measure(model, scans), "seconds": seconds(run)}
 
     key = fingerprint(_VERSION, checkpoint, collection / "manifest.json", json.dumps(asdict(protocol)))
-    return cached(folder / f"{name}_{steps}.json", key, result)
+    return load_or_compute(folder / f"{name}_{steps}.json", key, result)
 
 
 @lru_cache(maxsize=1)
@@ -135,7 +135,7 @@ def training_scenes(collection: Path) -> list[TrainingScene]:
 
 def mean_nose(collection: Path) -> np.ndarray:
     """The nose tip [3] of the training scenes, on average."""
-    return np.nanmean(shape_prior.load_landmarks(collection)[:, NOSE_TIP], axis=0)
+    return np.nanmean(shape_measures.load_landmarks(collection)[:, NOSE_TIP], axis=0)
 
 
 def seconds(run: Path, model: str = "shape") -> float:
@@ -151,7 +151,7 @@ def fit_scores(model: ShapeModel, scans: Sequence[Scan], w: np.ndarray, points: 
     """Mean distance (mm) of scan points to the surfaces of `w` [k, S], `face` and `head` (without hair), and the mean
     angle (degrees) of normals on the head without hair."""
     errors = [
-        shape_prior.scan_errors(model.field(model.latent("z_sdf", w[:, k])), scan, points)
+        shape_measures.scan_errors(model.field(model.latent("z_sdf", w[:, k])), scan, points)
         for k, scan in enumerate(scans)
     ]
     return {

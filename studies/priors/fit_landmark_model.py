@@ -14,7 +14,7 @@ from sira_mi.errors import InputError
 from sira_mi.training.landmark_regression import landmark_tensors
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
-from studies.priors.shape_prior import ShapeFit, fit_shape
+from studies.priors.shape_measures import ShapeFit, fit_shape
 
 _FOLDS = 8
 
@@ -27,7 +27,7 @@ class Places:
     true: np.ndarray  # [S, 468, 3], NaN where unknown
 
 
-def bare(prior: Avatar) -> Avatar:
+def without_landmark_model(prior: Avatar) -> Avatar:
     """The prior without a model of landmarks. Raises InputError where there is no deformation to carry landmarks."""
     if not prior.architecture.deforms:
         raise InputError("a prior without deformation has no landmarks in reference space; give another --prior")
@@ -35,19 +35,19 @@ def bare(prior: Avatar) -> Avatar:
     return Avatar(prior.architecture, kept, prior.roughness, prior.k_s, prior.k_r)
 
 
-def places(prior: Avatar, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None) -> Places:
+def place_landmarks(prior: Avatar, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None) -> Places:
     """The landmarks of scanned heads and of the prior's heads that are fitted to the scans."""
-    model, prior = ShapeModel.of_prior(prior), bare(prior)
+    model, prior = ShapeModel.of_prior(prior), without_landmark_model(prior)
     w = fit_shape(model, scenes, fit)
     placed = [landmarks_of(prior, model.field(model.latent("z_sdf", w[:, k]))) for k in range(len(scenes))]
     return Places(np.stack(placed), np.stack([scene.landmarks for scene in scenes]))
 
 
-def with_landmark_model(prior: Avatar, found: Places) -> Avatar:
+def add_landmark_model(prior: Avatar, found: Places) -> Avatar:
     return prior.replaced(**landmark_tensors(prior, found.placed, found.true))
 
 
-def held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
+def measure_held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
     """Mean distance in mm of placed landmarks to the true ones, and of modelled ones, each head by what the others
     tell. Raises InputError for too few heads."""
     count = len(found.placed)
@@ -58,7 +58,7 @@ def held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
     modelled = np.full_like(found.placed, np.nan)
     for k in range(_FOLDS):
         others = Places(found.placed[fold != k], found.true[fold != k])
-        model = LandmarkModel(with_landmark_model(prior, others))
+        model = LandmarkModel(add_landmark_model(prior, others))
         for head in np.flatnonzero(fold == k):
             placed = mi.TensorXf(np.ascontiguousarray(found.placed[head, known].T))
             modelled[head, known] = model(placed).numpy().T
