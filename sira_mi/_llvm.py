@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def locate_llvm() -> Path | None:
-    """The libLLVM that a PyPI package put beside this interpreter, newest first, or None.
+    """The newest libLLVM that a PyPI package put beside this interpreter, or None.
 
     Looks in the environment's `lib` folder (`karellen-llvm-core` installs `libLLVM.so.23.1` there)."""
     patterns = {"darwin": "libLLVM*.dylib", "win32": "LLVM-C.dll"}.get(sys.platform, "libLLVM*.so*")
@@ -18,8 +18,9 @@ def locate_llvm() -> Path | None:
 
 
 def configure_llvm() -> None:
-    """Sets `DRJIT_LIBLLVM_PATH` before Dr.Jit is first imported; a value that the user set is left alone. Warns when
-    Dr.Jit was imported already and hence looked for an LLVM of its own."""
+    """Sets `DRJIT_LIBLLVM_PATH`, which Dr.Jit reads when it is imported, unless the user has set it.
+
+    Warns when Dr.Jit is already imported: it may not have found this LLVM."""
     if "DRJIT_LIBLLVM_PATH" in os.environ or (library := locate_llvm()) is None:
         return
     if "drjit" in sys.modules:

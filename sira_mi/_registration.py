@@ -6,14 +6,16 @@ import importlib
 import importlib.util
 import sys
 from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
 
 _PLUGINS = "sira_mi.plugins"
 
 
 class _MitsubaFinder:
-    """Finds Mitsuba as usual, and has the plugins imported as soon as it is there."""
+    """Finds Mitsuba as usual, and imports the plugins right after it."""
 
-    def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
         if name != "mitsuba":
             return None
         sys.meta_path.remove(self)
@@ -21,19 +23,19 @@ class _MitsubaFinder:
         if spec is None or spec.loader is None:
             sys.meta_path.insert(0, self)
             return spec
-        execute = spec.loader.exec_module
+        loader: Any = spec.loader  # a method of this one loader is replaced
+        execute = loader.exec_module
 
-        def execute_and_register(module):
+        def execute_and_register(module: ModuleType) -> None:
             execute(module)
             importlib.import_module(_PLUGINS)
 
-        spec.loader.exec_module = execute_and_register
+        loader.exec_module = execute_and_register
         return spec
 
 
 def register_plugins_with_mitsuba() -> None:
-    """Imports the plugins, which register themselves for every variant: at once where Mitsuba is loaded, else when it
-    is."""
+    """Imports the plugins, which register themselves for every variant: now if Mitsuba is loaded, else once it is."""
     if "mitsuba" in sys.modules:
         importlib.import_module(_PLUGINS)
     else:

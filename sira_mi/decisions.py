@@ -1,28 +1,30 @@
-"""A plan as data: what is left out, why, and what that costs in exactness and saves in time."""
+"""What a picture or a fit leaves out: each decision with its reason, its bound and, once measured, its error."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One thing that may be left out. Errors of a picture are radiances, in units of that of a white diffuse surface
-    which faces the light best; errors of a fit are those of the losses' gradient, as a share of its largest entry. They
-    are 0 where nothing but rounding and the choice of random numbers differs."""
+    """One thing that may be left out.
+
+    The error of a picture is a radiance, in units of the radiance of a white diffuse surface that faces the light best.
+    The error of a fit is that of the loss gradient, as a share of its largest entry. An error is 0 when the result
+    differs only by rounding and by the choice of random numbers."""
 
     name: str
     where: str  # the stage of a fit, or "picture"
     left_out: bool
     reason: str  # the condition, and what was found
     bound: float = 0.0  # of the error
-    built_in: bool = False  # left out at all times: nothing switches it off
-    changes: Mapping[str, object] = field(default_factory=dict)  # settings that carry it out
-    error: float | None = None  # measured: root mean square over the head's pixels, largest over the gradient
-    noise: float | None = None  # of the measured error: what two seeds of one picture differ by
-    saved: float | None = None  # measured share of the time without this decision
-    saved_spread: float | None = None  # of that share: half the range of the runs
+    built_in: bool = False  # always left out; nothing switches it off
+    changes: Mapping[str, object] = field(default_factory=dict)  # the settings that carry it out
+    error: float | None = None  # measured: root mean square over the head's pixels, or largest over the gradient
+    noise: float | None = None  # of the measured error: the difference between two seeds of one picture
+    saved: float | None = None  # measured share of the time that is saved
+    saved_spread: float | None = None  # half the range of `saved` over the runs
 
 
 @dataclass(frozen=True)
@@ -33,27 +35,24 @@ class Plan:
 
     @property
     def bound(self) -> float:
-        """Of the error of all that is left out."""
+        """The bound of the error of everything that is left out."""
         return sum(d.bound for d in self.decisions if d.left_out)
 
     def leaves_out(self, name: str, where: str) -> bool:
-        """Whether the decision of that name, about that stage, is to leave out."""
+        """Whether the decision of this name about this stage leaves something out."""
         return any(d.left_out for d in self.decisions if (d.name, d.where) == (name, where))
 
-    def keeping(self, decisions: Iterable[Decision] | None = None) -> Plan:
-        """The plan that leaves out none of `decisions` (None: of all), but what is built in."""
-        kept = self.decisions if decisions is None else tuple(decisions)
+    def keep_all(self) -> Plan:
+        """The plan that leaves out only what is built in."""
         return Plan(
             tuple(
-                replace(d, left_out=False, reason=f"kept; {d.reason}")
-                if d in kept and d.left_out and not d.built_in
-                else d
+                replace(d, left_out=False, reason=f"kept; {d.reason}") if d.left_out and not d.built_in else d
                 for d in self.decisions
             )
         )
 
     def apply(self, settings):
-        """`settings`, a frozen dataclass, with the changes of all that is left out."""
+        """`settings`, a frozen dataclass, with the changes of everything that is left out."""
         changes: dict[str, object] = {}
         for decision in self.decisions:
             if decision.left_out:
@@ -61,27 +60,27 @@ class Plan:
         return replace(settings, **changes)
 
     def report(self) -> list[dict]:
-        """For `avatar.json`: each decision as a JSON object."""
+        """The decisions as JSON objects, for `avatar.json`."""
         return [{k: dict(v) if isinstance(v, Mapping) else v for k, v in asdict(d).items()} for d in self.decisions]
 
 
 def explain(plan: Plan) -> str:
-    """The plan in words, a line a decision."""
+    """The plan as text, one line per decision."""
     width = max(len(f"{d.name} ({d.where})") for d in plan.decisions)
     lines = []
     for d in plan.decisions:
         verdict = "built in" if d.built_in and d.left_out else "left out" if d.left_out else "needed"
-        lines.append(f"{verdict:8}  {f'{d.name} ({d.where})':{width}}  {d.reason}{_figures(d)}")
+        lines.append(f"{verdict:8}  {f'{d.name} ({d.where})':{width}}  {d.reason}{_format_figures(d)}")
     return "\n".join(lines)
 
 
-def _figures(decision: Decision) -> str:
+def _format_figures(decision: Decision) -> str:
     if not decision.left_out:
         return ""
     figures = [f"bound {decision.bound:.1e}" if decision.bound else "exact"]
     if decision.error is not None:
         noise = "" if not decision.noise else f" ± {decision.noise:.1e}"
         figures.append(f"measured {decision.error:.1e}{noise}")
-    if decision.saved is not None:
+    if decision.saved is not None and decision.saved_spread is not None:
         figures.append(f"{100 * decision.saved:.0f} ± {100 * decision.saved_spread:.0f} % of the time saved")
     return f" [{', '.join(figures)}]"

@@ -1,4 +1,4 @@
-"""Writing files so that none is ever left half-written, and the image formats that the project writes."""
+"""Writes files whole or not at all, and the image formats of the project."""
 
 import os
 from collections.abc import Callable
@@ -12,9 +12,9 @@ from sira_mi.errors import InputError
 
 
 def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Calls `write` with a temporary path of the same ending beside `path`, then renames it.
+    """Calls `write` with a temporary path beside `path` that has the same suffix, then renames the file.
 
-    Raises InputError when the place cannot be written or is full; nothing is left behind then."""
+    Raises InputError when the folder cannot be written or the disk is full; the temporary file is removed."""
     path = Path(path)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     try:
@@ -34,7 +34,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> None:
-    """A 32-bit OpenEXR of an image [H, W, 3] (channels RGB) or [H, W] (channel Y)."""
+    """Writes a 32-bit OpenEXR file of an image [H, W, 3] (channels RGB) or [H, W] (channel Y)."""
     pixels = np.ascontiguousarray(image, np.float32)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
@@ -49,6 +49,6 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
 
 
 def write_png(path: str | Path, values: np.ndarray) -> None:
-    """A PNG of display values in [0, 1], [H, W, 3] or [H, W]."""
+    """Writes a PNG file of display values in [0, 1], [H, W, 3] or [H, W]."""
     picture = Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
     write_through(path, lambda file: picture.save(file, format="PNG"))

@@ -1,4 +1,4 @@
-"""Mitsuba's variants: which of them the project can run on."""
+"""The variants of Mitsuba that the project can run on."""
 
 import mitsuba as mi
 

@@ -155,7 +155,7 @@ def test_a_plan_is_carried_out_and_switched_off():
     plan = Plan(decisions)
     settings = plan.apply(RelightSettings())
     assert settings.max_depth == 4 and settings.visibility and plan.bound == 1e-3
-    kept = plan.keeping()
+    kept = plan.keep_all()
     assert kept.apply(RelightSettings()) == RelightSettings() and kept.bound == 0
     assert kept.leaves_out("c", "picture") and not kept.leaves_out("a", "picture")
     text = explain(plan)
@@ -331,7 +331,7 @@ def test_a_fit_with_and_without_the_plan_is_the_same(problem):
         assert decision.error is None or decision.error <= 1e-5, decision
         assert (decision.error is None) == (decision.built_in or not decision.left_out)
     results = []
-    for one in (plan, plan.keeping()):
+    for one in (plan, plan.keep_all()):
         made.plan = one
         progress = Progress(dict(tensors))
         run_stages([(lambda _: made, stage) for _, stage in settings.stages], progress, settings.block, 0, lambda _: 0)
@@ -350,7 +350,7 @@ def test_a_changed_base_albedo_is_computed_again(problem):
     for z_a in (tensors["z_a"], tensors["z_a"] + 0.5):
         made.refresh({**tensors, "z_a": z_a})
         values.append(made._base_and_skin(made._fixed, stage, index)[0].numpy())
-        made.plan = made.plan.keeping()
+        made.plan = made.plan.keep_all()
         np.testing.assert_allclose(values[-1], made._base_and_skin(made._fixed, stage, index)[0].numpy(), atol=1e-6)
         made.plan = plan_fit(settings)
     assert np.abs(values[0] - values[1]).max() > 1e-3

@@ -82,7 +82,7 @@ def fit_photo(request: FitRequest) -> int:
         settings = without(settings, "pose")
     if request.polish:
         settings = replace(settings, stages=(*settings.stages, polish_stage()))
-    plan = plan_fit(settings).keeping() if request.keep_all else plan_fit(settings)
+    plan = plan_fit(settings).keep_all() if request.keep_all else plan_fit(settings)
     prior_path = request.prior or PRIOR
     prior = load_avatar(prior_path)
     portrait = read_portrait(request, settings, prior)

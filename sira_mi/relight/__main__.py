@@ -123,7 +123,7 @@ def _plan_pictures(subject, light, settings, yaws: list[float], options: argpars
     plan = plan_relight(subject, light, shape, everything, yaws, exact=settings.exact)
     if options.explain:
         print(explain(measure_plan(plan, subject, light, everything, yaws[0])), flush=True)
-    chosen = (plan.keeping() if options.keep_all else plan).apply(everything)
+    chosen = (plan.keep_all() if options.keep_all else plan).apply(everything)
     reloaded = (chosen.exact, chosen.specular) != (settings.exact, settings.specular)
     return chosen, load_head(subject, chosen) if reloaded else shape
 
