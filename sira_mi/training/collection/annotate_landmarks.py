@@ -1,6 +1,6 @@
-"""Finds where the 468 face landmarks lie on the MakeHuman topology; writes `data/landmark_barycentrics.npz`.
+"""Finds where the 468 face landmarks lie on the MakeHuman topology; writes `landmark_barycentrics.npz`.
 
-    python -m sira_mi.training.collection.annotate_landmarks --out sira_mi/collection/data/landmark_barycentrics.npz
+    python -m sira_mi.training.collection.annotate_landmarks
 
 Bald synthetic heads are marked by the portrait landmark network from the front and slightly aside. A landmark's place
 is the median over all pictures of its marks' rest-pose position, made symmetric and moved to the nearest surface point.
@@ -18,6 +18,7 @@ from tqdm import tqdm
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError, run_command
 from sira_mi.training.collection.annotation import AnnotationSettings, closest_on_surface, consensus, mark_views
+from sira_mi.training.collection.landmarks import BARYCENTRICS
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.skin import rest_surface
 from sira_mi.training.collection.surface import head_topology
@@ -56,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="sira_mi.training.collection.annotate_landmarks", description=__doc__.split("\n")[0]
     )
-    parser.add_argument("--out", type=Path, required=True, help=".npz file to write")
+    parser.add_argument("--out", type=Path, default=BARYCENTRICS, help=".npz file to write (default: the package's)")
     parser.add_argument("--heads", type=int, default=16)
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")

