@@ -139,7 +139,8 @@ def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
 def test_closed_form_agrees_with_path_tracing_on_a_convex_head(subject):
     """Nothing on a convex body is shadowed and no light is reflected twice, so that the closed form is only as far
     from path tracing as its integrals are approximate."""
-    result = compare(subject, Light(LOBES), 0.0, RelightSettings(samples=256, voxel=0.1))
+    settings = RelightSettings(samples=256, voxel=0.1)
+    result = compare(load_head(subject, settings), VIEW, Light(LOBES), 0.0, settings)
     assert abs(result.bias) < 0.006
     assert result.relative_error < 0.04, "mostly the noise of 256 samples"
     assert result.psnr > 35

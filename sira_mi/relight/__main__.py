@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     from tqdm import tqdm
 
     from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare
-    from sira_mi.relight.render import RelightSettings, load_scene, render_passes, write_image
+    from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes, write_image
     from sira_mi.relight.subject import read_light, read_subject
     from sira_mi.variants import set_variant
 
@@ -155,8 +155,9 @@ def main(arguments: list[str] | None = None) -> int:
     light = read_light(options.lights, subject.avatar, lobes=options.compare or options.integrator == "sg")
 
     if options.compare:
+        shape = load_head(subject, replace(settings, integrator="path"))
         with tqdm(total=settings.samples + CLOSED_FORM_SAMPLES, unit="spp", disable=None) as bar:
-            result = compare(subject, light, options.yaw, settings, bar.update)
+            result = compare(shape, subject.camera, light, options.yaw, settings, bar.update)
         for name, image in (("sg", result.closed_form), ("path", result.traced)):
             write_image(stem.with_name(f"{stem.name}_{name}"), image, options.exposure)
         print(f"sg   {result.seconds[0]:7.1f} s  {CLOSED_FORM_SAMPLES} samples a pixel")
