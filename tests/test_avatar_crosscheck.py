@@ -33,7 +33,6 @@ FIGURES = {
     "error": 0.0312,
     "noise": 0.0101,
     "bias": -0.004,
-    "pixels_off_by_more_than": {"0.05": 0.125},
 }
 
 
@@ -44,22 +43,22 @@ def voxel(monkeypatch):
     monkeypatch.setattr(RelightSettings, "__init__", lambda self, **options: default(self, **{"voxel": 0.2, **options}))
 
 
-def test_noise_is_told_from_the_error_of_the_closed_form(avatar, avatar_path):
-    """On a convex blob the closed form is almost exact: its error is little more than the noise of path tracing, which
-    halves with four times the samples."""
+def test_the_noise_of_path_tracing_is_taken_out(avatar, avatar_path):
+    """On a convex blob the closed form is almost exact: its error stays below the noise, which halves with four times
+    the samples."""
     subject, found = Subject(Path(avatar_path), avatar, camera(50.0)), {}
-    for samples in (16, 64):
+    for samples in (32, 128):
         found[samples], picture = cross_check(subject, Light(LOBES), ("blob", None), 20.0, samples, 0)
-    assert found[64]["noise"] == pytest.approx(0.5 * found[16]["noise"], rel=0.15)
+    assert found[128]["noise"] == pytest.approx(0.5 * found[32]["noise"], rel=0.15)
     for figures in found.values():
-        assert 0.9 * figures["noise"] < figures["error"] < figures["noise"] + 0.03
+        assert figures["error"] < 0.7 * figures["noise"]
         assert abs(figures["bias"]) < 0.03 and figures["psnr_db"] > 20
     assert picture.shape == (32, 96, 3) and picture.min() >= 0 and picture.max() <= 1
 
 
 def test_the_page_is_its_figures_and_nothing_else():
     text = page(FIGURES)
-    for words in ("`anna`", "that of the photo", "64 × 48", "38.2 dB", "3.12%", "1.01%", "-0.40%", "12.5%", "3.5 s"):
+    for words in ("`anna`", "that of the photo", "64 × 48", "38.2 dB", "3.12%", "1.01%", "-0.40%", "3.5 s"):
         assert words in text
     assert page({**FIGURES, "light": "studio.exr"}).startswith(text.split("Light")[0]) and "{" not in text
     assert page(json.loads(json.dumps(FIGURES))) == text
@@ -89,7 +88,7 @@ def test_the_command_writes_page_picture_and_figures(avatar_path, tmp_path):
         ({"avatar": "no surface"}, "no surface"),
         ({"--lights": "missing.json"}, "cannot be read"),
         ({"--size": "4"}, "--size is 4"),
-        ({"--spp": "0"}, "--spp is 0"),
+        ({"--spp": "1"}, "--spp is 1"),
         ({"--spp": "many"}, "invalid int value"),
         ({"--yaw": "inf"}, "--yaw is inf"),
         ({"--seed": "-1"}, "--seed is -1"),
@@ -105,7 +104,7 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     reference = avatar.tensors["reference"].copy()
     reference[-1] += 100.0
     save_avatar(bad / "no surface", avatar.replaced(reference=reference))
-    options = {"avatar": avatar_path, "--spp": "1", "--size": "8", "--out": str(out)}
+    options = {"avatar": avatar_path, "--spp": "2", "--size": "8", "--out": str(out)}
     for key, value in change.items():
         options[key] = str(bad / value) if key in ("avatar", "--lights", "--out") else value
     arguments = [options.pop("avatar"), *(text for pair in options.items() for text in pair)]

@@ -25,7 +25,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="a folder (default: the current one)")
     parser.add_argument("--size", type=int, default=256, metavar="N", help="longer side in pixels (default: 256)")
-    parser.add_argument("--spp", type=int, default=256, metavar="N", help="samples a pixel of path (default: 256)")
+    parser.add_argument("--spp", type=int, default=512, metavar="N", help="samples a pixel of path (default: 512)")
     parser.add_argument("--yaw", type=float, default=0.0, metavar="DEG", help="turns the head to its left (default: 0)")
     parser.add_argument("--seed", type=int, default=0, help="of the samples; the same seed repeats the figures")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
@@ -33,7 +33,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check(options: argparse.Namespace) -> None:
-    for name, low, high in (("size", 8, 4096), ("spp", 1, 1 << 20), ("seed", 0, 2**32 - 2)):
+    for name, low, high in (("size", 8, 4096), ("spp", 2, 1 << 20), ("seed", 0, 2**32 - 2)):
         value = getattr(options, name)
         if not low <= value <= high:
             raise InputError(f"--{name} is {value}; it must be {low} to {high}")
