@@ -1,19 +1,22 @@
+from collections.abc import Mapping
+
 import drjit as dr
 import mitsuba as mi
 
-from sira_mi.avatar.file import load_avatar
-from sira_mi.errors import InputError
-from sira_mi.fields.appearance import (
+from sira_mi.avatar.decoders import (
     albedo_refinement,
     albedo_refinement_cooperative,
-    deform_cooperative,
     diffuse_albedo,
     diffuse_albedo_cooperative,
     refined_albedo,
     specular_albedo,
     specular_albedo_cooperative,
 )
+from sira_mi.avatar.file import load_avatar
+from sira_mi.avatar.shape import HeadShape
+from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers, pack
+from sira_mi.fields.sdf import deform_cooperative
 
 
 def find_avatar(props, name: str = "avatar") -> str:
@@ -103,25 +106,21 @@ class NeuralAlbedo(mi.Texture):
         self.k_r = mi.Float(avatar.k_r)
         self.architecture = avatar.architecture
         self._pack()
-        self.bind(avatar.architecture, mi.Float(tensors["deformation"]), mi.Float(tensors["z_sdf"]), mi.Transform4f())
+        self.bind(HeadShape(avatar.architecture), tensors, mi.Transform4f())
 
-    def bind(self, architecture, deformation, z_sdf, to_local) -> None:
-        """Takes the reference space from a shape: its deformation network (flat parameters), its latent, and the
-        transform from world to the field's coordinates."""
-        if not architecture.deforms:
-            raise ValueError("neural_albedo: this avatar has no deformation, and so no reference space for albedos")
-        column = mi.TensorXf(z_sdf, (len(z_sdf), 1))
-        self._deformation = pack(layers(architecture.networks["deformation"], deformation, column))
+    def bind(self, shape: HeadShape, parameters: Mapping, to_local) -> None:
+        """Takes the reference space from a head: its shape, the parameters of that, and the transform from world to
+        the field's coordinates."""
+        self._deformation = pack(shape.deformation(parameters))
         self._to_local = to_local
-        self._space = (architecture, deformation, z_sdf, to_local)
+        self._space = (parameters, to_local)
 
     def bind_attribute(self, name: str) -> None:
         """Tells a baked texture the mesh attribute that its shape keeps the albedo in."""
         self._attribute = name
 
     def _network(self):
-        column = mi.TensorXf(self.latent, (len(self.latent), 1))
-        return layers(self.architecture.networks[f"{self.kind}_albedo"], self.weights, column)
+        return layers(self.architecture.networks[f"{self.kind}_albedo"], self.weights, self.latent)
 
     def _refinement_network(self):
         return layers(self.architecture.networks["albedo_refinement"], self.refinement)

@@ -2,11 +2,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import load_avatar, signed_distance_field
+from sira_mi.avatar.file import load_avatar
+from sira_mi.avatar.shape import POSE, SHAPE_PARAMETERS, HeadShape
 from sira_mi.fields import tracing
-from sira_mi.fields.columns import scatter_columns, to_columns
+from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, scatter_columns, to_columns
 from sira_mi.fields.extraction import extract
-from sira_mi.fields.sdf import CHUNK, SdfField, deform, evaluate_in_chunks, rigid_motion, signed_distance, surface
+from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 
 
@@ -96,18 +97,14 @@ class NeuralSDF(mi.Mesh):
         self.to_world = mi.Transform4f(matrix)
         self.to_local = self.to_world.inverse()
         self._matrix_to_local = np.linalg.inv(matrix)
-        self.architecture = avatar.architecture
-        self._keys = ("deformation", "reference", "z_sdf")
-        self.deformation = mi.Float(avatar.tensors["deformation"])
-        self.reference = mi.Float(avatar.tensors["reference"])
-        self.z_sdf = mi.Float(avatar.tensors["z_sdf"])
+        self.head_shape = HeadShape(avatar.architecture)
+        self.parameters = {name: mi.Float(avatar.tensors[name]) for name in SHAPE_PARAMETERS}
         if props.get("movable", False):
-            self._keys += ("pose",)
-            self.pose = mi.Float(np.zeros(6, np.float32))
+            self.parameters[POSE] = mi.Float(np.zeros(6, np.float32))
         self._updates = 0
         self._last_hits = None
         self._textures = [node for node in mi.traverse(self.bsdf()).hierarchy if isinstance(node, NeuralAlbedo)]
-        if self._textures and "pose" in self._keys:
+        if self._textures and POSE in self.parameters:
             raise ValueError("neural_sdf: a movable head cannot carry a neural_albedo, which does not move with it")
         self._bind_textures()
         self._extract()
@@ -116,9 +113,7 @@ class NeuralSDF(mi.Mesh):
 
     def field(self) -> SdfField:
         """The field's layers at the current parameters; differentiable where those are."""
-        z_sdf = mi.TensorXf(self.z_sdf, (len(self.z_sdf), 1))
-        motion = rigid_motion(mi.TensorXf(self.pose, (6, 1))) if "pose" in self._keys else None
-        return signed_distance_field(self.architecture, self.deformation, self.reference, z_sdf, motion)
+        return self.head_shape.field(self.parameters)
 
     def vertices(self) -> np.ndarray:
         """Vertices [3, V] of the mesh in the field's coordinates."""
@@ -152,7 +147,7 @@ class NeuralSDF(mi.Mesh):
     def _newton(self, columns: list[np.ndarray]) -> list[np.ndarray]:
         """Newton hits of rays [3, N], [3, N] from [1, N]. The last result is kept: `mi.render` traces the same rays
         once for the picture and once more for its derivative."""
-        parameters = tuple(dr.detach(getattr(self, key)) for key in self._keys)
+        parameters = tuple(map(dr.detach, self.parameters.values()))
         if self._last_hits is not None:
             rays, then, result = self._last_hits
             same_field = all(a.index == b.index for a, b in zip(parameters, then, strict=True))
@@ -186,7 +181,7 @@ class NeuralSDF(mi.Mesh):
     def _attach(self) -> None:
         """Sets the mesh to the extracted vertices, attached to those parameters that have gradients enabled."""
         x = self._x0
-        if any(dr.grad_enabled(getattr(self, key)) for key in self._keys):
+        if any(map(dr.grad_enabled, self.parameters.values())):
             f = signed_distance(self.field(), x)
             weight = self._gradient / np.maximum((self._gradient**2).sum(axis=0), 1e-4)
             x = x - mi.TensorXf(weight.astype(np.float32)) * (f - dr.detach(f))
@@ -200,7 +195,7 @@ class NeuralSDF(mi.Mesh):
 
     def _bind_textures(self) -> None:
         for texture in self._textures:
-            texture.bind(self.architecture, self.deformation, self.z_sdf, self.to_local)
+            texture.bind(self.head_shape, self.parameters, self.to_local)
 
     def _add_attributes(self) -> None:
         """Makes an empty vertex attribute for every baked texture, and tells the textures their names."""
@@ -228,11 +223,11 @@ class NeuralSDF(mi.Mesh):
 
     def traverse(self, callback):
         super().traverse(callback)
-        for key in self._keys:
-            callback.put(key, getattr(self, key), mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+        for key, value in self.parameters.items():
+            callback.put(key, value, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
     def parameters_changed(self, keys=()):
-        if not any(key in keys for key in self._keys):
+        if not any(key in keys for key in self.parameters):
             super().parameters_changed(keys)
             if any(texture.changed for texture in self._baked.values()):
                 self._renew_attributes()

@@ -1,12 +1,12 @@
 import drjit as dr
 import mitsuba as mi
 
+from sira_mi.avatar.decoders import rendered_radiance
 from sira_mi.avatar.file import load_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.appearance import rendered_radiance
-from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
+from sira_mi.fields.columns import from_columns, normalise, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import normalised, signed_distance, surface
+from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit, refined_approach
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
@@ -98,10 +98,9 @@ class SiraRadiance(mi.SamplingIntegrator):
             origin, direction, parameter = (to_columns(dr.gather(type(a), a, index)) for a in (local.o, local.d, t))
             x = differentiable_hit(field, origin, direction, parameter)
             _, gradient, x_ref, gamma = surface(field, x)
-            latent = mi.TensorXf(self.z_r, (len(self.z_r), 1))
-            network = layers(self.architecture.networks["rendering"], self.rendering, latent)
+            network = layers(self.architecture.networks["rendering"], self.rendering, self.z_r)
             octaves = self.architecture.rendering_octaves
-            radiance = rendered_radiance(network, octaves, x_ref, normalised(gradient), normalised(direction), gamma)
+            radiance = rendered_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
             color = scatter_columns(radiance, index, width, mi.Color3f)
         mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
         return color, hit, [mask, closest]

@@ -2,12 +2,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
-from sira_mi.fields.appearance import light_refinement
-from sira_mi.fields.columns import from_columns, scatter_columns, to_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, normalise, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import deform, evaluate_in_chunks, normalised, surface
+from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 from sira_mi.plugins.neural_sdf import find_head, trace_head
@@ -204,10 +204,10 @@ class SiraSG(mi.SamplingIntegrator):
             diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
             specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1) if speculars or self.aovs else None
             refined = [] if self.refinement is None else [self._light(x_ref, gamma)]
-            return shaded(x, direction, normalised(gradient), diffuse, specular, *refined)
+            return shaded(x, direction, normalise(gradient), diffuse, specular, *refined)
 
         def shaded(x, direction, normal, diffuse, specular, *refined):
-            radiance = radiances(x, normal, normalised(direction), diffuse, specular)
+            radiance = radiances(x, normal, normalise(direction), diffuse, specular)
             extra = (diffuse, specular, rotation @ normal) if self.aovs else ()
             return dr.concat([*radiance, *extra, *refined], axis=0)
 
@@ -304,7 +304,7 @@ def differentiable_arrays(head, bsdf, light) -> list:
     """Every array of the head, its material and its light that a gradient may be asked of."""
     textures = [t for t in (bsdf.diffuse_albedo, bsdf.specular_albedo) if isinstance(t, NeuralAlbedo)]
     own = [p for t in textures for p in (t.weights, t.latent, t.refinement, t.k_r)]
-    return [head.deformation, head.reference, head.z_sdf, bsdf.k_s, bsdf.roughness, light.lobes, light.scale, *own]
+    return [*head.parameters.values(), bsdf.k_s, bsdf.roughness, light.lobes, light.scale, *own]
 
 
 def local_lobes(light, head):

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import skimage.data
 
-from sira_mi.avatar.file import Avatar, AvatarArchitecture, save_avatar
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.conventions import LANDMARKS
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.fit.settings import QUALITIES, FitSettings

@@ -13,8 +13,9 @@ from conftest import SMALL, small_avatar
 from sira_mi.avatar import skin_tone
 from sira_mi.conventions import HELD_OUT_VIEWS, LANDMARKS, LUMINANCE
 from sira_mi.errors import InputError
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance_and_slope
+from sira_mi.fields.sdf import SdfField, signed_distance_and_slope
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.radiance import Material, radiance_of_scenes, reflected_radiance
 from sira_mi.training import af_sm

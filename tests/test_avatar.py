@@ -9,7 +9,8 @@ import pytest
 from conftest import SMALL
 from safetensors.numpy import save
 
-from sira_mi.avatar.file import FORMAT, Avatar, AvatarArchitecture, load_avatar, save_avatar
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import FORMAT, Avatar, load_avatar, save_avatar
 from sira_mi.errors import InputError
 
 
@@ -82,6 +83,17 @@ def test_files_of_other_kinds(tmp_path, data):
     path = tmp_path / "photo.png"
     path.write_bytes(data)
     complaint(path)
+
+
+def test_a_head_without_deformation_is_refused_and_an_older_file_opens(avatar, tmp_path):
+    """Earlier versions had both, and say `deforms` of either; the format still does."""
+    sizes = dataclasses.asdict(SMALL)
+    for stored in (sizes, {**sizes, "deforms": True}):
+        text = json.dumps(description(architecture=stored))
+        assert load_avatar(write(tmp_path / "a", avatar.tensors, text)).architecture == SMALL
+    text = json.dumps(description(architecture={**sizes, "deforms": False}))
+    assert "without a deformation" in complaint(write(tmp_path / "a", avatar.tensors, text))
+    assert SMALL.to_dict() == {**sizes, "deforms": True}
 
 
 def test_a_missing_file_and_a_folder(tmp_path):

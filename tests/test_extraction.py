@@ -6,7 +6,7 @@ import trimesh
 from doubles import head_field
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields import extraction, sdf
+from sira_mi.fields import columns, extraction, sdf
 
 RADIUS = 1.2
 
@@ -31,7 +31,7 @@ def test_extracted_sphere_has_the_volume_and_area_of_a_sphere():
 
 def test_coarse_to_fine_extraction_equals_the_dense_one(avatar):
     field = head_field(avatar)
-    evaluate = lambda x: sdf.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
+    evaluate = lambda x: columns.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
     for function, voxel in ((evaluate, 0.1), (sphere, 0.07)):
         fast, slow = extraction.extract(function, voxel), extraction.extract_reference(function, voxel)
         np.testing.assert_array_equal(fast.faces, slow.faces)

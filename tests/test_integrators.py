@@ -9,12 +9,13 @@ import pytest
 from conftest import camera, slopes
 from scipy.ndimage import binary_erosion
 
+from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import save_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.export import scene as scenes
-from sira_mi.fields.appearance import light_refinement
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import deform, evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import deform, signed_distance, surface
 from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.portrait.camera import Camera
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import SMALL
 
+from sira_mi.avatar.shape import head_of
 from sira_mi.errors import InputError
 from sira_mi.fields.mlp import evaluate, layers
 from sira_mi.optimisation import losses
@@ -239,7 +240,7 @@ def test_batches_keep_the_points_of_a_scene_together(two_scenes):
 
 def train_appearance(folder, scenes, parameters, until=None):
     frozen = [
-        af_sm.freeze_scene(SMALL, parameters, parameters["z_sdf"][:, k], scene, APPEARANCE, np.random.default_rng(k))
+        af_sm.freeze_scene(SMALL, head_of(parameters, k), scene, APPEARANCE, np.random.default_rng(k))
         for k, scene in enumerate(scenes)
     ]
     initial = af_sm.initial_appearance_model(SMALL, len(scenes), 0)
@@ -271,7 +272,7 @@ def test_the_specular_albedo_is_held_near_the_level_of_its_region(shape, two_sce
     """Where the decoder says 0.03 everywhere, the anchor is ln² of the factor that a region's level is off."""
     settings = dataclasses.replace(APPEARANCE, specular_levels=(0.03, 0.02, 0.07, 0.008))
     rng = np.random.default_rng(0)
-    frozen = af_sm.freeze_scene(SMALL, shape[0], shape[0]["z_sdf"][:, 0], two_scenes[0], settings, rng)
+    frozen = af_sm.freeze_scene(SMALL, head_of(shape[0], 0), two_scenes[0], settings, rng)
     model = af_sm.initial_appearance_model(SMALL, 1, 0)
     model["specular_albedo"] = np.zeros_like(model["specular_albedo"])
     values = {k: mi.TensorXf(v) if v.ndim == 2 else mi.Float(v) for k, v in model.items()}

@@ -7,7 +7,8 @@ import pytest
 from conftest import SMALL
 from doubles import encoded_in_double, head_field, in_double, points_near_surface
 
-from sira_mi.fields import appearance, mlp, sdf
+from sira_mi.avatar import decoders
+from sira_mi.fields import mlp, sdf
 from sira_mi.fields.encoding import encoded_size
 
 
@@ -82,19 +83,19 @@ def test_appearance_decoders_agree_in_both_modes(avatar):
 
     field = head_field(avatar)
     x_ref, gamma = sdf.deform(field, mi.TensorXf(x))
-    point, features = appearance.deform_cooperative(mlp.pack(field.deformation), 2, [mi.Float(c) for c in x])
+    point, features = sdf.deform_cooperative(mlp.pack(field.deformation), 2, [mi.Float(c) for c in x])
     a, s, r = layers("diffuse_albedo", "z_a"), layers("specular_albedo", "z_s"), layers("albedo_refinement")
     pairs = [
         (x_ref, point),
         (gamma, features),
         (
-            appearance.diffuse_albedo(a, 2, x_ref, gamma),
-            appearance.diffuse_albedo_cooperative(mlp.pack(a), 2, point, features),
+            decoders.diffuse_albedo(a, 2, x_ref, gamma),
+            decoders.diffuse_albedo_cooperative(mlp.pack(a), 2, point, features),
         ),
-        (appearance.specular_albedo(s, 1, x_ref), appearance.specular_albedo_cooperative(mlp.pack(s), 1, point)),
+        (decoders.specular_albedo(s, 1, x_ref), decoders.specular_albedo_cooperative(mlp.pack(s), 1, point)),
         (
-            appearance.albedo_refinement(r, 3, x_ref, gamma),
-            appearance.albedo_refinement_cooperative(mlp.pack(r), 3, point, features),
+            decoders.albedo_refinement(r, 3, x_ref, gamma),
+            decoders.albedo_refinement_cooperative(mlp.pack(r), 3, point, features),
         ),
     ]
     for tensor, rows in pairs:
@@ -105,18 +106,18 @@ def test_illumination_decoder_gives_unit_axes_and_bounded_lobes(avatar):
     """Even far from where it was trained."""
     network = mlp.layers(SMALL.networks["illumination"], mi.Float(avatar.tensors["illumination"] * 30))
     z = np.random.default_rng(0).standard_normal((SMALL.illumination_latent, 5)).astype(np.float32) * 20
-    lobes = appearance.illumination(network, mi.TensorXf(z)).numpy()
+    lobes = decoders.illumination(network, mi.TensorXf(z)).numpy()
     assert lobes.shape == (SMALL.lobes, 7, 5) and np.isfinite(lobes).all()
     assert np.abs(np.linalg.norm(lobes[:, :3], axis=1) - 1).max() < 1e-3
-    for rows, (low, high) in ((lobes[:, 3], appearance.LOG_SHARPNESS), (lobes[:, 4:], appearance.LOG_AMPLITUDE)):
+    for rows, (low, high) in ((lobes[:, 3], decoders.LOG_SHARPNESS), (lobes[:, 4:], decoders.LOG_AMPLITUDE)):
         assert np.exp(low) * 0.999 <= rows.min() and rows.max() <= np.exp(high) * 1.001
-    single = appearance.illumination(network, mi.TensorXf(z[:, 2:3].copy())).numpy()
+    single = decoders.illumination(network, mi.TensorXf(z[:, 2:3].copy())).numpy()
     np.testing.assert_allclose(lobes[:, :, 2], single[:, :, 0], rtol=1e-4)
 
 
 def test_refined_albedo_is_equation_11_within_its_range():
     base, fine = mi.TensorXf([[0.2, 0.9, 0.1]]), mi.TensorXf([[0.5, 0.5, -0.5]])
-    np.testing.assert_allclose(appearance.refined_albedo(base, fine, 0.4).numpy(), [[0.4, 1.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(decoders.refined_albedo(base, fine, 0.4).numpy(), [[0.4, 1.0, 0.0]], atol=1e-6)
 
 
 def test_several_latents_at_once_equal_single_evaluations(avatar):

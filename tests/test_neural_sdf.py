@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
 from sira_mi.export import scene as scenes
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import EmptySurfaceError
-from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import signed_distance, surface
 
 FIELD = ("z_sdf", "deformation", "reference")
 

@@ -16,7 +16,8 @@ from PIL import Image
 from sira_mi.avatar.file import save_avatar
 from sira_mi.errors import InputError
 from sira_mi.export.scene import head, sensor
-from sira_mi.fields.sdf import deform, evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.sdf import deform
 from sira_mi.files import write_exr
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module

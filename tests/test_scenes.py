@@ -88,9 +88,9 @@ def test_yaw_turns_the_head_and_not_the_light(avatar_path, one_light):
 def test_without_an_avatar_it_is_the_mean_head_of_the_prior():
     head = load("fit.xml", voxel=0.2).shapes()[0]
     prior = load_avatar()
-    assert head.architecture == prior.architecture
-    assert (head.z_sdf.numpy() == prior.tensors["z_sdf"]).all()
-    assert (head.reference.numpy() == prior.tensors["reference"]).all()
+    assert head.head_shape.architecture == prior.architecture
+    assert (head.parameters["z_sdf"].numpy() == prior.tensors["z_sdf"]).all()
+    assert (head.parameters["reference"].numpy() == prior.tensors["reference"]).all()
 
 
 def test_the_default_lights_are_there():
@@ -112,7 +112,7 @@ def test_avatars_are_found_beside_the_scene_and_in_the_current_folder(avatar, av
     write_lights(folder / "lights.json", avatar.tensors["lobes"])
     beside = mi.load_file(str(folder / "scene.xml"), voxel=0.1, integrator="path")
     for scene in (whole, here, beside):
-        assert (scene.shapes()[0].z_sdf.numpy() == expected).all()
+        assert (scene.shapes()[0].parameters["z_sdf"].numpy() == expected).all()
     assert picture(beside)[16, 16, :3].min() > 0
 
 

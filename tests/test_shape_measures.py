@@ -11,10 +11,11 @@ import pytest
 from conftest import SMALL, small_avatar
 from test_training import SIZES, ball_collection
 
+from sira_mi.avatar.decoders import rendered_radiance
 from sira_mi.errors import InputError
-from sira_mi.fields.appearance import rendered_radiance
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import extract
-from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.training import pictures, train
 from sira_mi.training.pictures import extracted_surface
 from sira_mi.training.scenes import TrainingScene

@@ -8,7 +8,7 @@ from conftest import slopes
 from doubles import field_in_double, head_field
 
 from sira_mi.conventions import DOMAIN_LOWER
-from sira_mi.fields import extraction, sdf, tracing
+from sira_mi.fields import columns, extraction, sdf, tracing
 
 
 def rays_at_head(count: int, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -104,19 +104,19 @@ def test_differentiable_hit_moves_as_the_traced_hit_does(avatar, name):
 def test_chunks_come_in_few_sizes_and_fill_columns_change_nothing(avatar):
     """Kernels depend on sizes: pictures with other numbers of hits must find theirs compiled."""
     field = head_field(avatar)
-    sizes = {sdf._padded_size(n) for n in range(1, sdf.CHUNK + 1)}
-    assert len(sizes) <= 33 and max(sizes) == sdf.CHUNK
-    assert all(n <= sdf._padded_size(n) <= max(2, 1.5 * n) for n in (1, 2, 3, 5, 700, 1025, 40_000))
+    sizes = {columns._padded_size(n) for n in range(1, columns.CHUNK + 1)}
+    assert len(sizes) <= 33 and max(sizes) == columns.CHUNK
+    assert all(n <= columns._padded_size(n) <= max(2, 1.5 * n) for n in (1, 2, 3, 5, 700, 1025, 40_000))
     x = np.random.default_rng(3).uniform(-1, 1, (3, 700)).astype(np.float32)
     value = lambda p: sdf.signed_distance(field, p)  # noqa: E731
-    (found,), expected = sdf.evaluate_in_chunks(value, x), value(mi.TensorXf(x)).numpy()
+    (found,), expected = columns.evaluate_in_chunks(value, x), value(mi.TensorXf(x)).numpy()
     assert found.shape == (1, 700)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_closest_approach_finds_the_smallest_distance_along_a_ray(avatar):
     field = head_field(avatar)
-    evaluate = lambda x: sdf.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
+    evaluate = lambda x: columns.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731
     surface = extraction.extract(evaluate, 0.05)
     grid = tracing.DistanceGrid.of(surface.grid, surface.spacing)
     origin, direction = rays_at_head(200)

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from conftest import SMALL
 
-from sira_mi.avatar.file import AvatarArchitecture, load_avatar
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import load_avatar
+from sira_mi.avatar.shape import head_of
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import extract
-from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.optimisation.adam import adam, read_arrays
 from sira_mi.training import af_sm, pictures, sa_sm, train
 from sira_mi.training import loop as training
+from sira_mi.training.__main__ import main
 from sira_mi.training.loop import run_training, trained_parameters
 from sira_mi.training.scenes import load_training_scenes
 from sira_mi.training.shape_model import ShapeModel
@@ -88,7 +90,7 @@ def run(collection, tmp_path_factory):
 def command(*arguments: str) -> None:
     before, sys.argv = sys.argv, ["train", *arguments]
     try:
-        train.main()
+        main()
     finally:
         sys.argv = before
 
@@ -119,27 +121,12 @@ def test_random_heads_have_the_mean_and_the_covariance_of_the_latents():
     assert np.allclose(np.cov(drawn), np.cov(z, bias=True), rtol=0.1, atol=0.2)
 
 
-def test_a_field_without_deformation_is_a_prior_for_the_ablation(collection, tmp_path):
-    """Its reference space is space itself, and its shape is the latent's all the same."""
-    sizes = [f"{k}={int(v)}" for k, v in {**SIZES, "deforms": 0}.items()]
-    arguments = ["--collection", str(collection), "--out", str(tmp_path), "--steps", "8", "--architecture", *sizes]
-    command("shape", *arguments)
-    prior = load_avatar(tmp_path / "prior.safetensors")
-    assert not prior.architecture.deforms
-    x = np.random.default_rng(0).standard_normal((3, 20)).astype(np.float32)
-    model = ShapeModel.of_prior(prior)
-    values = []
-    for w in (0, 3):
-        field = model.field(np.full(SMALL.sdf_latent, w, np.float32))
-        f, gradient, x_ref, _ = surface(field, mi.TensorXf(x))
-        assert np.allclose(x_ref.numpy(), x)
-        step = 1e-2 * gradient.numpy() / np.linalg.norm(gradient.numpy(), axis=0)
-        ahead, behind = (signed_distance(field, mi.TensorXf(x + s * step)).numpy() for s in (1, -1))
-        assert np.allclose((ahead - behind) / 2e-2, np.linalg.norm(gradient.numpy(), axis=0), rtol=2e-2)
-        values.append(f.numpy())
-    assert np.abs(values[1] - values[0]).max() > 1e-3
-    with pytest.raises(InputError, match="no reference space"):
-        command("appearance", "--collection", str(collection), "--out", str(tmp_path), "--steps", "2")
+def test_a_checkpoint_without_deformation_is_refused_and_an_older_one_opens(tmp_path):
+    """Earlier versions also trained heads without a deformation, and say `deforms` of the others."""
+    path = tmp_path / "shape.checkpoint"
+    assert train.read_architecture({"architecture": json.dumps({**SIZES, "deforms": True})}, path) == SMALL
+    with pytest.raises(InputError, match=r"shape\.checkpoint is of heads without a deformation"):
+        train.read_architecture({"architecture": json.dumps({**SIZES, "deforms": False})}, path)
 
 
 def test_the_terms_that_can_be_left_out_are_those_of_the_losses(collection):
@@ -161,7 +148,7 @@ def test_so_are_those_of_the_appearance(collection, run):
     shape, _ = trained_parameters(run / "shape.checkpoint")
     settings = af_sm.AppearanceTraining(scenes=1, points=8, frozen_points=50)
     scene = load_training_scenes(collection)[0]
-    frozen = af_sm.freeze_scene(SMALL, shape, shape["z_sdf"][:, 0], scene, settings, np.random.default_rng(0))
+    frozen = af_sm.freeze_scene(SMALL, head_of(shape, 0), scene, settings, np.random.default_rng(0))
     batch = af_sm.draw_batch([frozen], settings, np.random.default_rng(0))
     optimizer = adam(af_sm.initial_appearance_model(SMALL, 1, 0), af_sm.rates(settings, 0))
     terms = af_sm.appearance_losses(SMALL, settings, dict(optimizer.items()), batch)
@@ -212,7 +199,7 @@ def test_a_resume_with_other_options_is_refused(run, collection):
 
 
 def test_appearance_needs_a_trained_shape(tmp_path, collection):
-    with pytest.raises(InputError, match="train shape first"):
+    with pytest.raises(InputError, match="training shape first"):
         train.train_appearance(collection, tmp_path)
     run_training(tmp_path, "shape", 1, *plain())
     with pytest.raises(InputError, match="does not say its architecture"):

@@ -8,18 +8,15 @@ every size is checked against the architecture before any array is used.
 import dataclasses
 import json
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.fields.encoding import encoded_size
-from sira_mi.fields.mlp import Architecture, layers
-from sira_mi.fields.sdf import SdfField
 from sira_mi.files import write_through
 
 FORMAT = "sira-mi avatar 1"
@@ -31,104 +28,6 @@ _MAXIMUM_DIRECTIONS = 256
 OPTIONAL = {"light_refinement"}
 # Of a prior that knows how landmarks follow from places in reference space (`sira_mi.avatar.landmark_model`).
 LANDMARK_MODEL = {"landmark_placed", "landmark_directions", "landmark_offsets"}
-
-
-@dataclass(frozen=True)
-class AvatarArchitecture:
-    """Sizes of all decoders; octaves belong to the positional encoding of each network's point."""
-
-    features: int = 16  # N_γ, length of the auxiliary feature vector γ
-    sdf_octaves: int = 4
-    sdf_width: int = 96
-    sdf_depth: int = 4
-    sdf_latent: int = 128  # dimension of z_sdf
-    deforms: bool = True  # eqs 1-3; without, one field conditioned on z_sdf (H3D-Net, the ablation's baseline)
-    rendering_octaves: int = 5
-    rendering_width: int = 96
-    rendering_depth: int = 3
-    rendering_latent: int = 64  # dimension of z_r
-    albedo_octaves: int = 6
-    albedo_width: int = 64
-    albedo_depth: int = 3
-    albedo_latent: int = 32  # dimension of z_a
-    specular_octaves: int = 4
-    specular_width: int = 32
-    specular_depth: int = 2
-    specular_latent: int = 8  # dimension of z_s
-    refinement_octaves: int = 9
-    refinement_width: int = 96
-    refinement_depth: int = 3
-    lobes: int = 48  # N_l, number of spherical Gaussians of the illumination decoder
-    illumination_width: int = 64
-    illumination_depth: int = 2
-    illumination_latent: int = 24  # dimension of z_l
-
-    def __post_init__(self):
-        sizes = {k: v for k, v in dataclasses.asdict(self).items() if k != "deforms"}
-        if any(not isinstance(v, int) or not 0 < v <= 4096 for v in sizes.values()):
-            raise ValueError("every size of an avatar is a whole number from 1 to 4096")
-        if not isinstance(self.deforms, bool):
-            raise ValueError("deforms is true or false")
-
-    @cached_property
-    def networks(self) -> dict[str, Architecture]:
-        """The architecture of every network, by the name of its tensor."""
-        gamma = self.features
-        sdf = encoded_size(self.sdf_octaves)
-        albedo = encoded_size(self.albedo_octaves) + gamma
-        width, depth = self.sdf_width, self.sdf_depth
-        return {
-            "deformation": Architecture(sdf, 3 * self.deforms + gamma, width, depth, self.sdf_latent),
-            "reference": Architecture(sdf, 1, width, depth, 0 if self.deforms else self.sdf_latent),
-            "rendering": Architecture(
-                encoded_size(self.rendering_octaves) + 6 + gamma,
-                3,
-                self.rendering_width,
-                self.rendering_depth,
-                self.rendering_latent,
-            ),
-            "diffuse_albedo": Architecture(albedo, 3, self.albedo_width, self.albedo_depth, self.albedo_latent),
-            "specular_albedo": Architecture(
-                encoded_size(self.specular_octaves),
-                1,
-                self.specular_width,
-                self.specular_depth,
-                self.specular_latent,
-            ),
-            "albedo_refinement": Architecture(
-                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
-            ),
-            "light_refinement": Architecture(
-                encoded_size(self.refinement_octaves) + gamma, 3, self.refinement_width, self.refinement_depth
-            ),
-            "illumination": Architecture(
-                self.illumination_latent, 7 * self.lobes, self.illumination_width, self.illumination_depth
-            ),
-        }
-
-    @cached_property
-    def latents(self) -> dict[str, int]:
-        """Dimension of every latent, by the name of its tensor."""
-        return {
-            "z_sdf": self.sdf_latent,
-            "z_r": self.rendering_latent,
-            "z_a": self.albedo_latent,
-            "z_s": self.specular_latent,
-            "z_l": self.illumination_latent,
-        }
-
-
-def signed_distance_field(architecture: AvatarArchitecture, deformation, reference, z_sdf, motion=None) -> SdfField:
-    """The field of flat parameters of both networks and of shape latents, a tensor [dim, S]; `motion` as in
-    `SdfField`."""
-    networks, deforms = architecture.networks, architecture.deforms
-    return SdfField(
-        layers(networks["deformation"], deformation, z_sdf),
-        layers(networks["reference"], reference, None if deforms else z_sdf),
-        architecture.sdf_octaves,
-        deforms,
-        motion,
-    )
 
 
 @dataclass(frozen=True)
@@ -154,7 +53,7 @@ def save_avatar(path: str | Path, avatar: Avatar) -> None:
 
     Raises InputError when the file cannot be written."""
     description = {
-        "architecture": dataclasses.asdict(avatar.architecture),
+        "architecture": avatar.architecture.to_dict(),
         "roughness": avatar.roughness,
         "k_s": avatar.k_s,
         "k_r": avatar.k_r,
@@ -193,7 +92,7 @@ def load_avatar(path: str | Path | None = None) -> Avatar:
         raise InputError(f"{path} is damaged or not a safetensors file: {error}") from error
     try:
         description = json.loads(metadata["avatar"])
-        architecture = AvatarArchitecture(**description["architecture"])
+        architecture = AvatarArchitecture.from_dict(description["architecture"], path)
         scalars = {name: float(description[name]) for name in ("roughness", "k_s", "k_r")}
         avatar = Avatar(architecture, tensors, **scalars)
         _check(avatar)

@@ -9,8 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, signed_distance_field
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks
+from sira_mi.avatar.file import Avatar
+from sira_mi.avatar.shape import HeadShape, with_zero_latents
+from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.sdf import SdfField, deform
 
 # Fixed-point steps that find a landmark's place from its place in reference space.
 _STEPS = 4
@@ -20,9 +22,7 @@ def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
     """Which landmarks [468] bool the mean head has, and the places [3, L] of those in reference space."""
     mean = prior.tensors["landmarks"]
     known = np.isfinite(mean).all(axis=1)
-    decoders = mi.Float(prior.tensors["deformation"]), mi.Float(prior.tensors["reference"])
-    zero = mi.TensorXf(np.zeros((len(prior.tensors["z_sdf"]), 1), np.float32))
-    field = signed_distance_field(prior.architecture, *decoders, zero)
+    field = HeadShape(prior.architecture).field(with_zero_latents(prior.tensors))
     return known, evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
 
 

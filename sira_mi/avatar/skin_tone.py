@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.sdf import in_three
+from sira_mi.fields.columns import in_three
 from sira_mi.optimisation import losses
 
 # Measured facial skin in log linear RGB. The patches "light skin" and "dark skin" of the ColorChecker, made after

@@ -1,7 +1,20 @@
-"""Between Dr.Jit's vectors (one array a coordinate) and the tensors `[rows, N]` that networks take; differentiable."""
+"""Tensors `[rows, N]`, one column a point: the form that networks take. Conversions from and to Dr.Jit's vectors (one
+array a coordinate), evaluation in chunks, small helpers; all differentiable unless they say otherwise."""
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+# Points evaluated at once where no gradient is recorded; bounds the memory of dense evaluations.
+CHUNK = 1 << 16
+
+
+def to_array(value):
+    """A NumPy array as a Float if it is one-dimensional, else as a tensor; Dr.Jit arrays as they are."""
+    if not isinstance(value, np.ndarray):
+        return value
+    value = np.ascontiguousarray(value, dtype=np.float32)
+    return mi.Float(value) if value.ndim == 1 else mi.TensorXf(value)
 
 
 def to_columns(vector):
@@ -26,3 +39,40 @@ def scatter_columns(tensor, index, width: int, kind):
     result = dr.zeros(kind, width)
     dr.scatter(result, from_columns(tensor, kind), index)
     return result
+
+
+def in_three(row, axis: int = 0):
+    """A row repeated three times along `axis`. Dr.Jit's own broadcast has an atomic scatter as its adjoint, whose sum
+    of three varies with the order of threads; a concatenation has not."""
+    return dr.concat([row, row, row], axis=axis)
+
+
+def normalise(v):
+    """Columns of v [3, N] scaled to unit length; columns shorter than 1e-6 stay finite."""
+    square = v * v
+    length = dr.sqrt(square[0:1, :] + square[1:2, :] + square[2:3, :] + 1e-12)
+    return v / in_three(length)
+
+
+def _padded_size(count: int) -> int:
+    """The smallest of 2ᵏ and 3·2ᵏ⁻¹ that is not below `count`."""
+    power = 1 << max(count - 1, 1).bit_length()
+    return 3 * power // 4 if count <= 3 * power // 4 else power
+
+
+def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Applies `function` (tensors [rows, n] -> tensor or tuple of tensors) to the columns of `arrays` [rows, N],
+    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks come in few sizes, filled up by
+    their last column: a size is part of the kernels, and compiling them takes longer than running them."""
+    n = arrays[0].shape[1]
+    parts = []
+    with dr.suspend_grad():
+        for start in range(0, n, CHUNK):
+            piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
+            count = piece[0].shape[1]
+            piece = [np.pad(p, ((0, 0), (0, _padded_size(count) - count)), mode="edge") for p in piece]
+            result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
+            result = result if isinstance(result, tuple) else (result,)
+            dr.eval(*result)
+            parts.append([r.numpy()[:, :count] for r in result])
+    return [np.concatenate(column, axis=1) for column in zip(*parts, strict=True)]

@@ -19,6 +19,8 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
+from sira_mi.fields.columns import to_array
+
 SOFTPLUS_SHARPNESS = 100.0
 _LOG2_E = 1.4426950408889634
 _MAXIMUM_PARAMETERS = 4_000_000
@@ -96,11 +98,14 @@ class _AddBias(dr.CustomOp):
 
 
 def layers(architecture: Architecture, parameters, latent=None) -> list[tuple]:
-    """Unpacks flat `parameters` (Float [architecture.parameters]) into [(weight [out, in], bias [out, S]), ...].
+    """Unpacks flat `parameters` [architecture.parameters] into [(weight [out, in], bias [out, S]), ...].
 
-    `latent` is a tensor [architecture.latent, S]: one column for every scene of a batch, or None for zeros.
-    Differentiable in both."""
+    `latent` is [architecture.latent], or [architecture.latent, S] with one column for every scene of a batch, or None
+    for zeros. Both may be NumPy or Dr.Jit arrays; differentiable in the latter."""
     result, offset = [], 0
+    parameters, latent = to_array(parameters), to_array(latent)
+    if latent is not None and latent.ndim == 1:
+        latent = mi.TensorXf(latent, (len(latent), 1))
 
     def take(shape):
         nonlocal offset

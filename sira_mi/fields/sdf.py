@@ -11,22 +11,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.encoding import encode, encode_with_tangents
-from sira_mi.fields.mlp import Architecture, evaluate, evaluate_with_tangents
-
-# Points evaluated at once where no gradient is recorded; bounds the memory of dense evaluations.
-CHUNK = 1 << 16
+from sira_mi.fields.encoding import encode, encode_cooperative, encode_with_tangents
+from sira_mi.fields.mlp import Architecture, evaluate, evaluate_cooperative, evaluate_with_tangents
 
 
 @dataclass(frozen=True)
 class SdfField:
-    """The unpacked layers of both networks, the deformation's conditioned on z_sdf. Without a deformation (H3D-Net's
-    field, the baseline of the paper's ablation) the first network gives γ only, and the second is conditioned."""
+    """The unpacked layers of both networks, the deformation's conditioned on the latents of the shape."""
 
     deformation: list[tuple]
     reference: list[tuple]
     octaves: int  # of the positional encoding of x and of x_ref
-    deforms: bool = True
     motion: mi.TensorXf | None = None  # [3, 4] rigid, of points before they enter the networks; None for none
 
 
@@ -74,7 +69,13 @@ def deform(field: SdfField, x):
     """Eqs 1 and 2a: x [3, N] -> (x_ref = x + δ [3, N], γ [N_γ, N])."""
     x = _moved(field, x)
     h = evaluate(field.deformation, encode(x, field.octaves))
-    return (x + h[:3, :], h[3:, :]) if field.deforms else (x, h)
+    return x + h[:3, :], h[3:, :]
+
+
+def deform_cooperative(packed, octaves: int, x: list) -> tuple[list, list]:
+    """Eqs 1 and 2a in symbolic code: three Floats -> (x_ref as three Floats, γ as N_γ Floats)."""
+    h = [mi.Float(a) for a in evaluate_cooperative(packed, encode_cooperative(x, octaves))]
+    return [a + d for a, d in zip(x, h[:3], strict=True)], h[3:]
 
 
 def signed_distance(field: SdfField, x):
@@ -87,12 +88,9 @@ def _with_tangents(field: SdfField, x, tangents: list):
     x = _moved(field, x)
     if field.motion is not None:
         tangents = [field.motion[:, 0:3] @ t for t in tangents]
-    if field.deforms:
-        h, t = evaluate_with_tangents(field.deformation, *encode_with_tangents(x, tangents, field.octaves))
-        x_ref, gamma = x + h[:3, :], h[3:, :]
-        tangents = [a + b[:3, :] for a, b in zip(tangents, t, strict=True)]
-    else:
-        x_ref, gamma = x, evaluate(field.deformation, encode(x, field.octaves))
+    h, t = evaluate_with_tangents(field.deformation, *encode_with_tangents(x, tangents, field.octaves))
+    x_ref, gamma = x + h[:3, :], h[3:, :]
+    tangents = [a + b[:3, :] for a, b in zip(tangents, t, strict=True)]
     h, t = encode_with_tangents(x_ref, tangents, field.octaves)
     value, slopes = evaluate_with_tangents(field.reference, h, t)
     return value, slopes, x_ref, gamma
@@ -112,40 +110,3 @@ def surface(field: SdfField, x):
     axes = [mi.TensorXf(np.repeat(basis[:, k : k + 1], n, axis=1)) for k in range(3)]
     value, slopes, x_ref, gamma = _with_tangents(field, x, axes)
     return value, dr.concat(slopes, axis=0), x_ref, gamma
-
-
-def in_three(row, axis: int = 0):
-    """A row repeated three times along `axis`. Dr.Jit's own broadcast has an atomic scatter as its adjoint, whose sum
-    of three varies with the order of threads; a concatenation has not."""
-    return dr.concat([row, row, row], axis=axis)
-
-
-def normalised(v):
-    """Columns of v [3, N] scaled to unit length; columns shorter than 1e-6 stay finite."""
-    square = v * v
-    length = dr.sqrt(square[0:1, :] + square[1:2, :] + square[2:3, :] + 1e-12)
-    return v / in_three(length)
-
-
-def _padded_size(count: int) -> int:
-    """The smallest of 2ᵏ and 3·2ᵏ⁻¹ that is not below `count`."""
-    power = 1 << max(count - 1, 1).bit_length()
-    return 3 * power // 4 if count <= 3 * power // 4 else power
-
-
-def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
-    """Applies `function` (tensors [rows, n] -> tensor or tuple of tensors) to the columns of `arrays` [rows, N],
-    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks come in few sizes, filled up by
-    their last column: a size is part of the kernels, and compiling them takes longer than running them."""
-    n = arrays[0].shape[1]
-    parts = []
-    with dr.suspend_grad():
-        for start in range(0, n, CHUNK):
-            piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
-            count = piece[0].shape[1]
-            piece = [np.pad(p, ((0, 0), (0, _padded_size(count) - count)), mode="edge") for p in piece]
-            result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
-            result = result if isinstance(result, tuple) else (result,)
-            dr.eval(*result)
-            parts.append([r.numpy()[:, :count] for r in result])
-    return [np.concatenate(column, axis=1) for column in zip(*parts, strict=True)]

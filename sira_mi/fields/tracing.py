@@ -12,14 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import DOMAIN_LOWER
-from sira_mi.fields.sdf import (
-    CHUNK,
-    SdfField,
-    evaluate_in_chunks,
-    in_three,
-    signed_distance,
-    signed_distance_and_slope,
-)
+from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, in_three
+from sira_mi.fields.sdf import SdfField, signed_distance, signed_distance_and_slope
 
 # A hit counts as exact when |f| is below this many scene units: within 0.01 mm of the surface where the gradient has a
 # fifth of its typical length or more.

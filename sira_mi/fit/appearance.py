@@ -5,11 +5,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, light_refinement, refined_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.decisions import Plan
-from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, light_refinement, refined_albedo
+from sira_mi.fields.columns import evaluate_in_chunks, in_three
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fields.sdf import evaluate_in_chunks, in_three
 from sira_mi.fit.leave_out import BASE_ALBEDO, SPECULARS, plan_fit
 from sira_mi.fit.residual import albedo_shares, albedo_variances, light_variances, log_residual, share_loss
 from sira_mi.fit.settings import FitSettings, Stage

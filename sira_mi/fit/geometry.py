@@ -11,8 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, signed_distance_field
+from sira_mi.avatar.file import Avatar
 from sira_mi.avatar.landmark_model import LandmarkModel, placed_landmarks, reference_landmarks
+from sira_mi.avatar.shape import POSE, SHAPE_LATENTS, SHAPE_NETWORKS, SHAPE_PARAMETERS, HeadShape
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_columns
 from sira_mi.fields.sdf import SdfField, deform, rigid_motion, surface
@@ -23,14 +24,8 @@ from sira_mi.optimisation import losses
 from sira_mi.portrait.camera import Camera, landmark_weights
 from sira_mi.portrait.portrait import Portrait
 
-_PARAMETERS = {
-    "z_sdf": "head.z_sdf",
-    "deformation": "head.deformation",
-    "reference": "head.reference",
-    "z_r": "integrator.z_r",
-    "rendering": "integrator.rendering",
-    "pose": "head.pose",
-}
+_PARAMETERS = {name: f"head.{name}" for name in (*SHAPE_PARAMETERS, POSE)}
+_PARAMETERS |= {name: f"integrator.{name}" for name in ("z_r", "rendering")}
 _STAY_POINTS = 256
 
 
@@ -70,18 +65,14 @@ class GeometryProblem:
         }
 
     def _field(self, tensors: dict) -> SdfField:
-        z_sdf = mi.TensorXf(tensors["z_sdf"], (len(tensors["z_sdf"]), 1))
-        motion = rigid_motion(mi.TensorXf(tensors["pose"], (6, 1)))
-        return signed_distance_field(
-            self.avatar.architecture, tensors["deformation"], tensors["reference"], z_sdf, motion
-        )
+        return HeadShape(self.avatar.architecture).field(tensors)
 
     def _landmarks(self, avatar: Avatar) -> dict | None:
         """The landmarks of the mean head [L], those of them that the photo has weighted, the others not."""
         on_head, x_ref = reference_landmarks(avatar)
         pixels = self.portrait.head_landmarks[on_head]
         in_photo = np.isfinite(pixels).all(axis=1)
-        if in_photo.sum() < 6 or not avatar.architecture.deforms:
+        if in_photo.sum() < 6:
             return None
         weights = np.where(in_photo, landmark_weights(len(on_head))[on_head], 0).astype(np.float32)
         return {
@@ -106,7 +97,7 @@ class GeometryProblem:
         self.head.remesh_at_next_update()
         for name, key in _PARAMETERS.items():
             self.parameters[key] = mi.Float(tensors[name])
-        self.parameters.set_dirty("head.z_sdf")
+        self.parameters.set_dirty(_PARAMETERS[POSE])
         self.parameters.update()
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
@@ -127,7 +118,7 @@ class GeometryProblem:
             "color": weights.color * stage.color * color,
             "mask": weights.mask * mask,
             "eikonal": weights.eikonal * losses.eikonal_loss(gradient),
-            "embedding": weights.embedding * (_square(current["z_sdf"]) + _square(current["z_r"])),
+            "embedding": weights.embedding * sum(_square(current[name]) for name in (*SHAPE_LATENTS, "z_r")),
         }
         if self.landmarks is not None:
             terms["landmark"] = weights.landmark * stage.landmark * self._landmark_loss(field)
@@ -195,12 +186,8 @@ class GeometryProblem:
         the photo does not show stays what the prior says."""
         points = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_STAY_POINTS, 3)).astype(np.float32)
         x = mi.TensorXf(np.ascontiguousarray(points.T))
-        prior = {
-            "z_sdf": dr.detach(tensors["z_sdf"]),
-            "deformation": mi.Float(self.avatar.tensors["deformation"]),
-            "reference": mi.Float(self.avatar.tensors["reference"]),
-            "pose": dr.detach(tensors["pose"]),
-        }
+        prior = {name: self.avatar.tensors[name] for name in SHAPE_NETWORKS}
+        prior |= {name: dr.detach(tensors[name]) for name in (*SHAPE_LATENTS, POSE)}
         return losses.mean(dr.abs(deform(field, x)[0] - deform(self._field(prior), x)[0]))
 
 

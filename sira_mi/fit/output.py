@@ -13,7 +13,8 @@ from PIL import Image
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.export.scene import head, principal_point_offset, sensor
-from sira_mi.fields.sdf import evaluate_in_chunks, surface
+from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.sdf import surface
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb

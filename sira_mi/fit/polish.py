@@ -17,10 +17,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from skimage.transform import resize_local_mean
 
+from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, refined_albedo, specular_albedo
 from sira_mi.avatar.file import Avatar, load_avatar
 from sira_mi.export.scene import head, sensor
-from sira_mi.fields.appearance import albedo_refinement, diffuse_albedo, refined_albedo, specular_albedo
-from sira_mi.fields.sdf import deform, evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.sdf import deform
 from sira_mi.fit.appearance import AppearanceProblem
 from sira_mi.fit.output import head_box
 from sira_mi.fit.settings import FitSettings, Stage

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from skimage.draw import polygon2mask
 
-from sira_mi.fields.sdf import in_three
+from sira_mi.fields.columns import in_three
 from sira_mi.fit.shaded import PhotoPoints
 from sira_mi.fit.skin import near_landmarks
 from sira_mi.optimisation import losses

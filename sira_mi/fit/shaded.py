@@ -8,11 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.export.scene import sensor
-from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import evaluate_in_chunks, surface
+from sira_mi.fields.sdf import surface
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait

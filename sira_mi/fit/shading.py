@@ -8,9 +8,10 @@ surface."""
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.decoders import diffuse_albedo
 from sira_mi.avatar.file import Avatar
-from sira_mi.fields.appearance import diffuse_albedo
-from sira_mi.fields.sdf import SdfField, normalised, surface
+from sira_mi.fields.columns import normalise
+from sira_mi.fields.sdf import SdfField, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.fit.geometry import GeometryProblem
 from sira_mi.fit.settings import FitSettings, Stage
@@ -50,6 +51,6 @@ class ShadingProblem(GeometryProblem):
         _, gradient, x_ref, gamma = surface(field, differentiable_hit(field, *rays))
         network = decoder(self.avatar, "diffuse_albedo", current, "z_a")
         albedo = diffuse_albedo(network, self.avatar.architecture.albedo_octaves, x_ref, gamma)
-        shading = shade_points(self.avatar, current, stage.k_s[1], points, albedo, normalised(gradient))
+        shading = shade_points(self.avatar, current, stage.k_s[1], points, albedo, normalise(gradient))
         target = np.ascontiguousarray(self.photo.image[points.row, points.column].T, np.float32)
         return losses.photometric_loss(shading.diffuse + shading.specular, mi.TensorXf(target))

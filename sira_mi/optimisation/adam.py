@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from sira_mi.errors import InputError
+from sira_mi.fields.columns import to_array
 from sira_mi.files import write_through
 
 
@@ -21,12 +22,6 @@ def adam(parameters: Mapping[str, np.ndarray], learning_rates: Mapping[str, floa
         optimizer[name] = to_array(value)
         optimizer.set_learning_rate({name: learning_rates[name]})
     return optimizer
-
-
-def to_array(value: np.ndarray):
-    """A Float for a one-dimensional array, else a tensor."""
-    value = np.ascontiguousarray(value, dtype=np.float32)
-    return mi.Float(value) if value.ndim == 1 else mi.TensorXf(value)
 
 
 def parameter_values(optimizer) -> dict[str, np.ndarray]:

@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sira_mi.fields.columns import from_columns
-from sira_mi.fields.sdf import deform, evaluate_in_chunks, surface
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns
+from sira_mi.fields.sdf import deform, surface
 from sira_mi.sg.multisampling import COSINE
 from sira_mi.sg.radiance import Material, reflected_radiance
 from sira_mi.sg.visibility import (

@@ -22,8 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import to_columns
-from sira_mi.fields.sdf import in_three
+from sira_mi.fields.columns import in_three, to_columns
 from sira_mi.sg import brdf
 from sira_mi.sg.integrals import sphere_integral
 from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions, lobe_count, unpack_lobe

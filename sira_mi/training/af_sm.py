@@ -5,18 +5,21 @@ a trained SA-SM."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import AvatarArchitecture, signed_distance_field
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.decoders import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
+from sira_mi.avatar.shape import HeadShape
 from sira_mi.avatar.skin_tone import SKIN_LUMINANCE, skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.appearance import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.columns import evaluate_in_chunks, in_three
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import deform, evaluate_in_chunks, in_three, surface
+from sira_mi.fields.sdf import deform, surface
 from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.radiance import Material, radiance_of_scenes
@@ -74,16 +77,13 @@ class FrozenScene:
 
 def freeze_scene(
     architecture: AvatarArchitecture,
-    shape: dict[str, np.ndarray],
-    z_sdf: np.ndarray,
+    shape: Mapping[str, np.ndarray],
     scene: TrainingScene,
     settings: AppearanceTraining,
     rng: np.random.Generator,
 ) -> FrozenScene:
-    """Evaluates a trained SA-SM (`shape`: its `deformation` and `reference`) with latent `z_sdf` at points of a
-    scene."""
-    decoders = mi.Float(shape["deformation"]), mi.Float(shape["reference"])
-    field = signed_distance_field(architecture, *decoders, mi.TensorXf(z_sdf[:, None]))
+    """Evaluates the head of a trained SA-SM with the parameters `shape` (`HeadShape`) at points of a scene."""
+    field = HeadShape(architecture).field(shape)
     count = len(scene.points)
     chosen = np.sort(rng.choice(count, min(settings.frozen_points, count), replace=False))
     x = scene.points[chosen].T

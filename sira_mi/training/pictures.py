@@ -12,11 +12,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import affine_transform
 
+from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface, extract
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import SdfField, signed_distance, surface
 from sira_mi.files import write_png
 from sira_mi.sg.radiance import Material, reflected_radiance
 from sira_mi.training.scenes import TrainingScene

@@ -3,12 +3,11 @@
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, AvatarArchitecture
-from sira_mi.fields.appearance import illumination
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.decoders import illumination
+from sira_mi.avatar.file import Avatar
 from sira_mi.fields.mlp import initial_parameters, layers
-
-NETWORKS_OF_SHAPE = ("deformation", "reference", "rendering")
-NETWORKS_OF_APPEARANCE = ("diffuse_albedo", "specular_albedo", "illumination")
+from sira_mi.training import af_sm, sa_sm
 
 
 def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,9 +61,7 @@ def assemble_prior(
         "z_s": "specular_albedo",
         "z_l": "illumination",
     }
-    tensors = {name: shape[name] for name in NETWORKS_OF_SHAPE} | {
-        name: appearance[name] for name in NETWORKS_OF_APPEARANCE
-    }
+    tensors = {name: shape[name] for name in sa_sm.NETWORKS} | {name: appearance[name] for name in af_sm.NETWORKS}
     latents = {**shape, **appearance}
     for name, network in owners.items():
         tensors[network] = whitened(architecture, network, tensors[network], *whitening(latents[name]))

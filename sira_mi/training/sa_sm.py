@@ -8,16 +8,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import AvatarArchitecture, signed_distance_field
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.decoders import rendered_radiance
+from sira_mi.avatar.shape import SHAPE_LATENTS, SHAPE_NETWORKS, HeadShape
 from sira_mi.errors import InputError
-from sira_mi.fields.appearance import rendered_radiance
+from sira_mi.fields.columns import normalise
 from sira_mi.fields.mlp import initial_parameters, layers
-from sira_mi.fields.sdf import deform, normalised, sphere_parameters, surface
+from sira_mi.fields.sdf import deform, sphere_parameters, surface
 from sira_mi.optimisation import losses
 from sira_mi.training.scenes import TrainingScene
 
-NETWORKS = ("deformation", "reference", "rendering")
-LATENTS = ("z_sdf", "z_r")
+NETWORKS = (*SHAPE_NETWORKS, "rendering")
+LATENTS = (*SHAPE_LATENTS, "z_r")
 
 # Deviation of the random heads' points from the scenes' surfaces, scene units.
 _JITTER = 0.1
@@ -131,20 +133,20 @@ def _columns_of(tensor, scenes: int, first: int, last: int):
 
 def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: ShapeBatch) -> dict:
     """Every term of eq. 7 and the two on scan normals and distances, unweighted, by the names of `ShapeTraining`."""
-    z_sdf, z_r = (parameters[name] @ batch.scenes for name in LATENTS)
+    latents = {name: parameters[name] @ batch.scenes for name in LATENTS}
     networks = architecture.networks
-    decoders = parameters["deformation"], parameters["reference"]
-    field = signed_distance_field(architecture, *decoders, z_sdf)
-    random_heads = signed_distance_field(architecture, *decoders, dr.detach(z_sdf) @ batch.mixture)
+    field = HeadShape(architecture).field({**parameters, **latents})
+    mixed = {name: dr.detach(latents[name]) @ batch.mixture for name in SHAPE_LATENTS}
+    random_heads = HeadShape(architecture).field({**parameters, **mixed})
     n = batch.normals.shape[1] // batch.count
     width = batch.points.shape[1] // batch.count
     everywhere = surface(field, batch.points)
     f, gradient, x_ref, gamma = (_columns_of(t, batch.count, 0, n) for t in everywhere)
     f_volume = _columns_of(everywhere[0], batch.count, n, width)
     points = _columns_of(batch.points, batch.count, 0, n)
-    rendering = layers(networks["rendering"], parameters["rendering"], z_r)
+    rendering = layers(networks["rendering"], parameters["rendering"], latents["z_r"])
     octaves = architecture.rendering_octaves
-    radiance = rendered_radiance(rendering, octaves, x_ref, normalised(gradient), batch.views, gamma)
+    radiance = rendered_radiance(rendering, octaves, x_ref, normalise(gradient), batch.views, gamma)
     return {
         "surface": losses.surface_loss(f),
         "normal": losses.normal_loss(gradient, batch.normals),
@@ -154,7 +156,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         "deformation": losses.deformation_loss(x_ref - points, batch.count),
         "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
         "color": losses.photometric_loss(radiance, batch.colors),
-        "embedding": losses.embedding_loss(z_sdf) + losses.embedding_loss(z_r),
+        "embedding": sum(losses.embedding_loss(z) for z in latents.values()),
     }
 
 

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, AvatarArchitecture, signed_distance_field
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import Avatar
+from sira_mi.avatar.shape import HeadShape
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField
-from sira_mi.training.prior import NETWORKS_OF_SHAPE as NETWORKS
 from sira_mi.training.prior import whitening
-
-LATENTS = ("z_sdf", "z_r")
+from sira_mi.training.sa_sm import LATENTS, NETWORKS
 
 
 @dataclass(frozen=True)
@@ -59,11 +58,8 @@ class ShapeModel:
 
     def layers_at(self, network: str, latent=None) -> list[tuple]:
         """Unpacked layers of a network, its latent a tensor [dim, S] or None."""
-        return layers(self.architecture.networks[network], mi.Float(self.networks[network]), latent)
+        return layers(self.architecture.networks[network], self.networks[network], latent)
 
     def field(self, latent) -> SdfField:
-        """The signed distance field of shape latents: a tensor [dim, S], or one NumPy vector [dim]."""
-        if isinstance(latent, np.ndarray):
-            latent = mi.TensorXf(np.ascontiguousarray(latent[:, None], np.float32))
-        decoders = mi.Float(self.networks["deformation"]), mi.Float(self.networks["reference"])
-        return signed_distance_field(self.architecture, *decoders, latent)
+        """The signed distance field of the shape's latent, [dim] or [dim, S]."""
+        return HeadShape(self.architecture).field({**self.networks, "z_sdf": latent})

@@ -16,7 +16,7 @@ from sira_mi.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from sira_mi.avatar.file import AvatarArchitecture
+    from sira_mi.avatar.architecture import AvatarArchitecture
 
 # The loss terms of each model whose weight λ is a setting of that name.
 SHAPE_TERMS = (
@@ -35,7 +35,7 @@ APPEARANCE_TERMS = ("embedding", "smoothness", "specular_anchor", "white_light",
 
 def parse_sizes(items: list[str]) -> dict[str, int]:
     """`["sdf_width=64", ...]` as sizes of an AvatarArchitecture. Raises InputError for anything else."""
-    from sira_mi.avatar.file import AvatarArchitecture
+    from sira_mi.avatar.architecture import AvatarArchitecture
 
     names, sizes = [field.name for field in dataclasses.fields(AvatarArchitecture)], {}
     for item in items:
@@ -44,9 +44,7 @@ def parse_sizes(items: list[str]) -> dict[str, int]:
             raise InputError(f"--architecture {item}: unknown size {name!r}; known are {', '.join(names)}")
         if not value.isascii() or not value.isdigit():
             raise InputError(f"--architecture {item}: give a whole number, e.g. {name}=64")
-        if name == "deforms" and value not in ("0", "1"):
-            raise InputError(f"--architecture {item}: deforms is 0 or 1")
-        sizes[name] = bool(int(value)) if name == "deforms" else int(value)
+        sizes[name] = int(value)
     return sizes
 
 
@@ -72,10 +70,10 @@ def without_term(settings, terms: tuple[str, ...], without: str | None):
 
 def read_architecture(metadata: dict[str, str], checkpoint: Path) -> AvatarArchitecture:
     """The architecture that a training's checkpoint holds. Raises InputError when there is none."""
-    from sira_mi.avatar.file import AvatarArchitecture
+    from sira_mi.avatar.architecture import AvatarArchitecture
 
     try:
-        return AvatarArchitecture(**json.loads(metadata["architecture"]))
+        return AvatarArchitecture.from_dict(json.loads(metadata["architecture"]), checkpoint)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{checkpoint} does not say its architecture ({error}); train it again") from error
 
@@ -84,7 +82,7 @@ def describe(architecture: AvatarArchitecture, settings, seed: int) -> dict[str,
     """What a resumed training must have in common with the one that it continues: all but the number of steps."""
     values = {k: v for k, v in dataclasses.asdict(settings).items() if k != "steps"}
     return {
-        "architecture": json.dumps(dataclasses.asdict(architecture), sort_keys=True),
+        "architecture": json.dumps(architecture.to_dict(), sort_keys=True),
         "settings": json.dumps({**values, "seed": seed}, sort_keys=True),
     }
 
@@ -101,19 +99,14 @@ def train_shape(
     scenes: list | None = None,
 ) -> dict[str, np.ndarray]:
     """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
-    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already.
-
-    A field without deformation has no reference space for albedos: `out/prior.safetensors` is written at once then,
-    with untrained appearance."""
+    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
     import numpy as np
 
-    from sira_mi.avatar.file import AvatarArchitecture, save_avatar
+    from sira_mi.avatar.architecture import AvatarArchitecture
     from sira_mi.optimisation.adam import adam
     from sira_mi.training import sa_sm
-    from sira_mi.training.af_sm import initial_appearance_model
     from sira_mi.training.loop import run_training
     from sira_mi.training.pictures import shape_picture
-    from sira_mi.training.prior import assemble_prior
     from sira_mi.training.scenes import load_training_scenes
     from sira_mi.training.shape_model import ShapeModel
 
@@ -133,7 +126,7 @@ def train_shape(
         model = ShapeModel.of_training(architecture, parameters)
         shape_picture(path, model, parameters["z_sdf"], scenes, seed)
 
-    trained = run_training(
+    return run_training(
         out,
         "shape",
         sa_sm.all_steps(settings),
@@ -145,11 +138,6 @@ def train_shape(
         picture=picture,
         picture_steps=picture_steps,
     )
-    if not architecture.deforms:
-        appearance = initial_appearance_model(architecture, len(scenes), seed)
-        landmarks = np.stack([scene.landmarks for scene in scenes])
-        save_avatar(out / "prior.safetensors", assemble_prior(architecture, trained, appearance, landmarks, 0.5, seed))
-    return trained
 
 
 def train_appearance(
@@ -169,21 +157,21 @@ def train_appearance(
     import numpy as np
 
     from sira_mi.avatar.file import save_avatar
+    from sira_mi.avatar.shape import head_of
     from sira_mi.optimisation.adam import adam
     from sira_mi.training import af_sm
     from sira_mi.training.loop import run_training, trained_parameters
     from sira_mi.training.pictures import AppearancePicture
     from sira_mi.training.prior import assemble_prior
+    from sira_mi.training.sa_sm import LATENTS, NETWORKS
     from sira_mi.training.scenes import load_training_scenes
-    from sira_mi.training.shape_model import LATENTS, NETWORKS, ShapeModel
+    from sira_mi.training.shape_model import ShapeModel
 
     checkpoint = out / "shape.checkpoint"
     if not checkpoint.exists():
         raise InputError(f"{checkpoint} is missing; run python -m sira_mi.training shape first")
     shape, metadata = trained_parameters(checkpoint)
     trained = read_architecture(metadata, checkpoint)
-    if not trained.deforms:
-        raise InputError(f"{checkpoint} has no deformation, and so no reference space for albedos")
     architecture = with_sizes(trained, sizes or {})
     frozen_sizes = ("features", "sdf_", "rendering_")
     for name in sizes or {}:
@@ -198,9 +186,7 @@ def train_appearance(
     if any(shape[name].shape != (architecture.latents[name], len(scenes)) for name in LATENTS):
         raise InputError(f"{out} was trained on {shape['z_sdf'].shape[1]} scenes, {collection} has {len(scenes)}")
     frozen = [
-        af_sm.freeze_scene(
-            architecture, shape, shape["z_sdf"][:, k], scene, settings, np.random.default_rng([seed, 5, k])
-        )
+        af_sm.freeze_scene(architecture, head_of(shape, k), scene, settings, np.random.default_rng([seed, 5, k]))
         for k, scene in enumerate(scenes)
     ]
     initial = af_sm.initial_appearance_model(architecture, len(scenes), seed)

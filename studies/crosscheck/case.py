@@ -66,8 +66,6 @@ def load_case(path: Path | None, size: int) -> Case:
     else:
         subject = read_subject(path, size)
         avatar, camera, name, file = subject.avatar, subject.camera, f"`{path.name}`", str(subject.path.absolute())
-    if not avatar.architecture.deforms:
-        raise InputError(f"{path}: this avatar has no deformation, and so no albedos; give one of a whole fit")
     return Case(name, file, avatar.roughness, avatar.k_s, scenes.sensor(camera), camera.width, camera.height)
 
 

@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.columns import from_columns, to_columns
-from sira_mi.fields.sdf import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
 from sira_mi.plugins.sira_sg import rotation_of, unoccluded_directions
 from sira_mi.sg import brdf, shading, visibility
 from sira_mi.sg.lobes import lobe_count, unpack_lobe

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.columns import to_columns
-from sira_mi.fields.sdf import deform, evaluate_in_chunks, normalised, surface
+from sira_mi.fields.columns import evaluate_in_chunks, normalise, to_columns
+from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import on_ray
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.plugins.sira_sg import rotation_of, scale_of
@@ -77,7 +77,7 @@ def field_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: i
     def columns(x, direction):
         _, gradient, x_ref, gamma = surface(field, x)
         albedos = (texture.evaluate_columns(x_ref, gamma) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo))
-        return (normalised(gradient), -normalised(direction), *albedos)
+        return (normalise(gradient), -normalise(direction), *albedos)
 
     normal, view, diffuse, specular = evaluate_in_chunks(columns, x, direction.numpy())
     lift = SHADOW_OFFSET * head.voxel * scale_of(head.to_world)

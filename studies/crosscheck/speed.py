@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, AvatarArchitecture, save_avatar
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.conventions import LANDMARKS
 from sira_mi.export import scene as scenes
 from sira_mi.fields.mlp import initial_parameters

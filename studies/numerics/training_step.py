@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import AvatarArchitecture
+from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.fields.mlp import Architecture
 from sira_mi.optimisation.adam import adam
 from sira_mi.training import sa_sm

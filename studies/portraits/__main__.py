@@ -53,13 +53,12 @@ def main() -> None:
     fits.add_argument(
         "--ablations", choices=("draft", "standard", "high"), default="draft", help="quality of all methods"
     )
-    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.1 to b.7)")
+    fits.add_argument("--methods", nargs="+", metavar="NAME", help="methods to compare (default: all, a.3 to b.7)")
     fits.add_argument(
         "--portraits", nargs="+", default=(), metavar="NAME", help="portraits (default: the primary ones)"
     )
     fits.add_argument("--all-lights", action="store_true", help="every portrait, not one of each head")
     fits.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
-    fits.add_argument("--prior-without-deformation", type=Path, metavar="PRIOR", help="for the methods a.1 and a.2")
     fits.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     arguments = parser.parse_args()
     run = {"build": make_benchmark, "skin": measure_skin, "landmarks": correct_landmarks, "fit": compare_fits}
@@ -85,7 +84,6 @@ def compare_fits(arguments: argparse.Namespace) -> None:
             quality,
             methods,
             arguments.prior or PRIOR,
-            arguments.prior_without_deformation,
             primary=not arguments.all_lights,
             only=tuple(arguments.portraits),
             variant=arguments.variant,

@@ -36,7 +36,6 @@ class Comparison:
     quality: str = "standard"
     methods: tuple[str, ...] = tuple(method.name for method in METHODS)
     prior: Path = PRIOR
-    prior_without_deformation: Path | None = None  # for the methods without deformation
     primary: bool = True  # one portrait of each identity, not all of its lights
     only: tuple[str, ...] = ()  # names of portraits; all when empty
     seed: int = 0
@@ -47,8 +46,6 @@ def compare(comparison: Comparison) -> list[dict]:
     """Fits and scores: rows of `portrait`, `identity`, `light`, `method`, `scores`, and of a fit `seconds` by stage,
     `total_seconds` and `peak_memory_megabytes`, or its `error`. What RUNS holds already is not done again."""
     methods = _complete(comparison.methods)
-    if any(not BY_NAME[name].deforms for name in methods) and comparison.prior_without_deformation is None:
-        raise InputError("methods without deformation need their prior: give --prior-without-deformation")
     entries = [
         entry
         for entry in read_benchmark(comparison.benchmark)
@@ -104,7 +101,7 @@ def _portrait_rows(comparison: Comparison, entry: dict, methods: list[str]):
         job = Job(
             folder / "photo.jpg",
             name,
-            comparison.prior if method.deforms else comparison.prior_without_deformation,
+            comparison.prior,
             QUALITIES[comparison.quality],
             out,
             None if method.after is None else out.with_name(method.after),

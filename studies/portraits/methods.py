@@ -1,10 +1,10 @@
 """The methods that the benchmark compares: the fit itself and the paper's ablations (Figure 4), as data.
 
-Geometry: a.1 and a.2 fit a field without deformation (H3D-Net), whose rendering function is not learned before; a.3 has
-deformation and reference, a.4 is SIRA. Appearance, all from the geometry of a.4 on: b.1 has no prior, b.2 the AF-SM and
-its schedule, b.3 is the fit as it ships, with the refinement, b.4 is b.3 with a shading stage, which a draft has not,
-b.5 a polish after b.3, b.6 is b.3 without shadows: all light of the upper hemisphere arrives at every point, and b.7
-gives all that base albedo and light leave of the photo to the albedo, as the paper does.
+Geometry: a.3 has a rendering function that is not learned before, a.4 is SIRA. Appearance, all from the geometry of a.4
+on: b.1 has no prior, b.2 the AF-SM and its schedule, b.3 is the fit as it ships, with the refinement, b.4 is b.3 with a
+shading stage, which a draft has not, b.5 a polish after b.3, b.6 is b.3 without shadows: all light of the upper
+hemisphere arrives at every point, and b.7 gives all that base albedo and light leave of the photo to the albedo, as the
+paper does.
 """
 
 from collections.abc import Callable
@@ -32,18 +32,14 @@ class Method:
     title: str
     stages: Callable[[Stages], Stages]  # of the shipped fit's stages, those that this method runs
     start: Callable[[Avatar, Tensors, int], Tensors]  # (prior, tensors, seed) -> tensors before the first stage
-    deforms: bool = True  # which prior: the shipped one, or the field without deformation
     after: str | None = None  # the method whose result it goes on from
     shadows: bool = True
 
     def settings(self, settings: FitSettings) -> FitSettings:
-        """The settings of a fit by this method at the quality of `settings`. Nothing ties δ to a prior where there is
-        none."""
-        geometry = settings.geometry if self.deforms else replace(settings.geometry, stay=0.0)
+        """The settings of a fit by this method at the quality of `settings`."""
         return replace(
             settings,
             stages=self.stages(settings.stages),
-            geometry=geometry,
             shadows=self.shadows,
             learned_radiance=self.start is not _untrained_rendering,
         )
@@ -71,20 +67,16 @@ def _untrained_appearance(prior: Avatar, tensors: Tensors, seed: int) -> Tensors
     return {**tensors, **networks, **{f"z_{k}": np.zeros_like(tensors[f"z_{k}"]) for k in "asl"}}
 
 
-def _rendering_from_scratch(moved: dict[str, str | None]) -> Callable[[Stages], Stages]:
-    """The geometry stages with the rendering function, untrained before, optimised fast from the first on; `moved` says
-    for every other tensor at whose rate it is optimised, None for not at all."""
-
-    def stages(shipped: Stages) -> Stages:
-        result = []
-        for kind, stage in _of_kind(GEOMETRY)(shipped):
-            rates = {k: v for k, v in stage.rates.items() if k in ("z_sdf", "pose")}
-            rates["rendering"] = max(stage.rates.get("rendering", 0.0), 2e-3)
-            rates |= {name: stage.rates[like] for name, like in moved.items() if like in stage.rates}
-            result.append((kind, replace(stage, rates=rates)))
-        return tuple(result)
-
-    return stages
+def _rendering_from_scratch(shipped: Stages) -> Stages:
+    """The geometry stages with the rendering function, untrained before, optimised fast from the first on, and without
+    its latent."""
+    result = []
+    for kind, stage in _of_kind(GEOMETRY)(shipped):
+        rates = {k: v for k, v in stage.rates.items() if k in ("z_sdf", "pose")}
+        rates["rendering"] = max(stage.rates.get("rendering", 0.0), 2e-3)
+        rates |= {k: v for k, v in stage.rates.items() if k == "deformation"}
+        result.append((kind, replace(stage, rates=rates)))
+    return tuple(result)
 
 
 def _without_prior(shipped: Stages) -> Stages:
@@ -117,26 +109,7 @@ def _all_to_the_albedo(shipped: Stages) -> Stages:
 
 
 METHODS = (
-    Method(
-        "a.1",
-        "no deformation, latent only",
-        _rendering_from_scratch({}),
-        _untrained_rendering,
-        deforms=False,
-    ),
-    Method(
-        "a.2",
-        "no deformation, decoder fine-tuned (H3D-Net)",
-        _rendering_from_scratch({"deformation": "deformation", "reference": "deformation"}),
-        _untrained_rendering,
-        deforms=False,
-    ),
-    Method(
-        "a.3",
-        "deformation and reference",
-        _rendering_from_scratch({"deformation": "deformation"}),
-        _untrained_rendering,
-    ),
+    Method("a.3", "deformation and reference", _rendering_from_scratch, _untrained_rendering),
     Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),

@@ -19,13 +19,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import Avatar, save_avatar, signed_distance_field
+from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
+from sira_mi.avatar.file import Avatar, save_avatar
+from sira_mi.avatar.shape import HeadShape, head_of
 from sira_mi.conventions import HELD_OUT_VIEWS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fields.appearance import diffuse_albedo, illumination, specular_albedo
-from sira_mi.fields.columns import from_columns, to_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
 from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import evaluate_in_chunks, surface
+from sira_mi.fields.sdf import surface
 from sira_mi.optimisation.adam import adam, parameter_values
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
@@ -131,10 +132,9 @@ def fit_appearance_latents(
     """z_a, z_s and z_l [dim, S] of `scenes`, whose shape latents `z_sdf` [dim, S] are given, by the AF-SM's own losses
     on the scenes' observations; everything else is frozen, and true albedo is never seen."""
     fit = fit or LatentFit()
+    shape = {**avatar.tensors, "z_sdf": z_sdf}
     frozen = [
-        af_sm.freeze_scene(
-            avatar.architecture, avatar.tensors, z_sdf[:, k], scene, settings, np.random.default_rng([seed, 5, k])
-        )
+        af_sm.freeze_scene(avatar.architecture, head_of(shape, k), scene, settings, np.random.default_rng([seed, 5, k]))
         for k, scene in enumerate(scenes)
     ]
     settings = dataclasses.replace(
@@ -176,8 +176,7 @@ class Factors:
 
 def surface_inputs(avatar: Avatar, z_sdf: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """x_ref [3, N], γ [N_γ, N] and unit normals [3, N] of the field with latent `z_sdf` [dim] at points [N, 3]."""
-    decoders = mi.Float(avatar.tensors["deformation"]), mi.Float(avatar.tensors["reference"])
-    field = signed_distance_field(avatar.architecture, *decoders, mi.TensorXf(z_sdf[:, None]))
+    field = HeadShape(avatar.architecture).field({**avatar.tensors, "z_sdf": z_sdf})
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x: surface(field, x), points.T)
     return [x_ref, gamma, gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)]
 

@@ -28,9 +28,7 @@ class Places:
 
 
 def without_landmark_model(prior: Avatar) -> Avatar:
-    """The prior without a model of landmarks. Raises InputError where there is no deformation to carry landmarks."""
-    if not prior.architecture.deforms:
-        raise InputError("a prior without deformation has no landmarks in reference space; give another --prior")
+    """The prior without a model of landmarks."""
     kept = {name: values for name, values in prior.tensors.items() if name not in LANDMARK_MODEL}
     return Avatar(prior.architecture, kept, prior.roughness, prior.k_s, prior.k_r)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sira_mi.avatar.file import AvatarArchitecture
+from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.files import write_through
 from studies.cache import read
 from studies.markdown import average, number, percent, table

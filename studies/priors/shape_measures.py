@@ -19,11 +19,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from sira_mi.avatar.decoders import rendered_radiance
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fields.appearance import rendered_radiance
+from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface
-from sira_mi.fields.sdf import SdfField, deform, evaluate_in_chunks, signed_distance, surface
+from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.optimisation import losses
 from sira_mi.optimisation.adam import adam
 from sira_mi.portrait.landmarks import NOSE_TIP

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,8 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.file import AvatarArchitecture
-from sira_mi.fields.sdf import evaluate_in_chunks, signed_distance, surface
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.shape import SHAPE_NETWORKS, SHAPE_PARAMETERS, HeadShape
+from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.loop import trained_parameters
@@ -102,7 +104,7 @@ def size(collection: Path, evidence: Path, name: str, sizes: dict[str, int], ste
         forward, backward = evaluation_cost(model, protocol.cost_points)
         return {
             **fit_scores(model, scans, w, protocol.points),
-            "parameters": sum(len(model.networks[network]) for network in ("deformation", "reference")),
+            "parameters": sum(len(model.networks[network]) for network in SHAPE_NETWORKS),
             "forward": forward,
             "backward": backward,
             "sizes": {size: getattr(model.architecture, size) for size in SIZES},
@@ -171,13 +173,11 @@ def evaluation_cost(model: ShapeModel, points: int, repeats: int = 7) -> tuple[f
         evaluate_in_chunks(lambda p: signed_distance(field, p), x)
 
     def backward() -> None:
-        values = {name: mi.Float(model.networks[name]) for name in ("deformation", "reference")}
-        z = mi.TensorXf(model.means["z_sdf"][:, None])
-        dr.enable_grad(values, z)
-        changed = replace(model, networks=model.networks | values)
-        f, gradient, _, _ = surface(changed.field(z), mi.TensorXf(x))
+        values = {name: mi.Float((model.networks | model.means)[name]) for name in SHAPE_PARAMETERS}
+        dr.enable_grad(values)
+        f, gradient, _, _ = surface(HeadShape(model.architecture).field(values), mi.TensorXf(x))
         dr.backward(losses.surface_loss(f) + losses.eikonal_loss(gradient))
-        dr.eval([dr.grad(v) for v in values.values()], dr.grad(z))
+        dr.eval([dr.grad(v) for v in values.values()])
         dr.sync_thread()
 
     return tuple(_shortest(f, repeats) / points * 1e6 for f in (forward, backward))

@@ -49,9 +49,9 @@ class Field64:
 
     @staticmethod
     def of(field: SdfField) -> Field64:
-        """The same numbers in float64; of a field that deforms space, and stays where it is."""
-        if not field.deforms or field.motion is not None:
-            raise ValueError("the reference in float64 is of fields with a deformation and without a motion")
+        """The same numbers in float64; of a field that stays where it is."""
+        if field.motion is not None:
+            raise ValueError("the reference in float64 is of fields without a motion")
         layers = [
             [tuple(np.array(part.numpy(), np.float64) for part in layer) for layer in network]
             for network in (field.deformation, field.reference)

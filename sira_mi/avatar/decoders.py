@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.fields.columns import in_three
 from sira_mi.fields.encoding import encode, encode_cooperative
 from sira_mi.fields.mlp import evaluate, evaluate_cooperative
-from sira_mi.fields.sdf import in_three
 from sira_mi.sg.lobes import fibonacci_directions
 
 # Bounds of the illumination decoder: log-sharpness and log-amplitude of a lobe, and its initial sharpness.
@@ -72,12 +72,6 @@ def specular_albedo_cooperative(packed, octaves: int, x_ref: list) -> list:
 def albedo_refinement_cooperative(packed, octaves: int, x_ref: list, gamma: list) -> list:
     """`albedo_refinement` in symbolic code."""
     return [dr.tanh(mi.Float(a)) for a in evaluate_cooperative(packed, encode_cooperative(x_ref, octaves) + gamma)]
-
-
-def deform_cooperative(packed, octaves: int, x: list) -> tuple[list, list]:
-    """Eqs 1 and 2a in symbolic code: three Floats -> (x_ref as three Floats, γ as N_γ Floats)."""
-    h = [mi.Float(a) for a in evaluate_cooperative(packed, encode_cooperative(x, octaves))]
-    return [a + d for a, d in zip(x, h[:3], strict=True)], h[3:]
 
 
 def illumination(network: list[tuple], latent):
