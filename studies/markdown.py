@@ -1,4 +1,4 @@
-"""Tables and numbers of the pages that evaluations write."""
+"""Tables and numbers of the pages that the studies write."""
 
 from collections.abc import Sequence
 
@@ -11,22 +11,23 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
-def number(value: float, digits: int = 2) -> str:
-    """A number with `digits` decimals; a dash for NaN."""
-    return f"{value:.{digits}f}" if np.isfinite(value) else "–"
+def number(value: float | None, digits: int = 2) -> str:
+    """A number with `digits` decimals; a dash for None and NaN."""
+    return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
 def percent(value: float) -> str:
+    """A share as a whole percentage."""
     return f"{100 * value:.0f}%"
 
 
 def average(rows: Sequence[dict], *path: str) -> float:
-    """The mean over rows of the number at a path of keys, NaN left out."""
-    values = []
+    """The mean over rows of the number at a path of keys, NaN left out; NaN when none is left."""
+    found = []
     for row in rows:
         value = row
         for key in path:
             value = value[key]
-        values.append(value)
-    values = np.array(values, float)
+        found.append(value)
+    values = np.array(found, float)
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

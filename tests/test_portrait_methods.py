@@ -1,4 +1,4 @@
-"""The benchmark's methods: what each optimises, that fits are kept and go on from each other, the results page."""
+"""The benchmark's methods: what each optimises, that fits are kept and go on from each other."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from sira_mi.avatar.file import PRIOR
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import APPEARANCE, GEOMETRY, QUALITIES, SHADING
 from sira_mi.optimisation.adam import read_arrays
-from studies.portraits import compare_methods, page, run_fit
+from studies.portraits import compare_methods, run_fit
 from studies.portraits.fit_job import Job
 from studies.portraits.methods import BY_NAME, METHODS
 from studies.portraits.run_fit import run
@@ -123,35 +123,6 @@ def test_a_photo_without_a_face_is_a_result_that_says_so(tmp_path):
     Image.new("RGB", (128, 128), (90, 90, 90)).save(blank)
     result = run(Job(blank, "a.4", PRIOR, TINY, tmp_path / "a.4", None))
     assert "no face" in result["error"]
-
-
-def rows() -> list[dict]:
-    """Made-up rows of two portraits; scores grow with the portrait."""
-    names = {c.score for c in page.GEOMETRY_COLUMNS + page.APPEARANCE_COLUMNS}
-    result = []
-    for k, light in enumerate(("studio", "extreme")):
-        for j, method in enumerate((compare_methods.MEAN_HEAD, "a.3", "a.4", "b.3")):
-            scores = {name: 2.0 - 0.4 * j + 0.1 * k for name in names}
-            row = {"portrait": f"p{k}", "identity": f"i{k}", "light": light, "method": method, "scores": scores}
-            if method != compare_methods.MEAN_HEAD:
-                row |= {"seconds": {"latents": 10.0 + k}, "total_seconds": 20.0 + k, "peak_memory_megabytes": 900 + k}
-            result.append(row)
-    return result
-
-
-def test_results_page_says_what_is_reached_and_what_is_missed(tmp_path, monkeypatch):
-    (tmp_path / "images").mkdir()
-    monkeypatch.setattr(page, "picture", lambda *arguments: np.zeros((4, 4, 3)))
-    failed = {"portrait": "p2", "identity": "i2", "light": "studio", "method": "a.3", "error": "no face found"}
-    described = page.Described(tmp_path, tmp_path, "standard", "draft")
-    text = page.write_results(rows(), [*rows(), failed], described, tmp_path).read_text()
-    assert "| face, both directions, mm | ≤ 1 | 0.85 | reached |" in text
-    assert "| the same over the mean head's | ≤ 0.7 | 0.41 | reached |" in text
-    assert "| final render, dB | ≥ 34 | 0.8 | **missed** by 33.1 |" in text
-    assert "| a.4 minus the best of a.1 to a.3, mm | ≤ 0 | – | – |" in text
-    assert "| time of a fit, s | ≤ 300 | 41 | reached |" in text
-    assert "| p2 | a.3 | no face found |" in text
-    assert (tmp_path / "images" / "results.png").exists()
 
 
 def test_unknown_methods_and_portraits_are_named(tmp_path):

@@ -4,7 +4,7 @@ The network draws the far side of a turned face too near, and calls other points
 the prior's heads carry. That error goes with the direction from which the face is seen, and the correction is a
 polynomial of it. The coefficients come from portraits of heads whose landmarks are known
 (`python -m studies.portraits landmarks`). Coordinates of the face's shape would tell a little more of the error on such
-heads (`docs/results.md`), but rendered heads do not smile, and the correction of a smile was wrong.
+heads (`docs/notebook/portraits.md`), but rendered heads do not smile, and the correction of a smile was wrong.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""`python -m studies.portraits build|skin|landmarks|fit …`: portraits of known heads, and how close fits come to them.
+"""`python -m studies.portraits build|fit|page|skin|landmarks …`: portraits of known heads, and how close fits come.
 
-`build` photographs test heads of the collection under known light; portraits that are there already are kept. `fit`
-fits and scores them and writes `docs/results.md`. `skin` measures on portraits of training heads what the brightness
-of skin and eyes tells of the skin's albedo: the values of `sira_mi.fit.skin`. `landmarks` measures on them, and on the
-collection's training scans, where landmarks of found faces and of the prior's heads are off, and writes both
-corrections.
+`build` renders portraits of the collection's test heads under known light; it resumes. `fit` fits and scores them and
+writes the figures, `docs/data/portraits.json`, the picture and the page, `docs/results.md`; `page` writes the page from
+the figures alone. `skin` and `landmarks` use portraits of training heads: `skin` measures how the radiance of skin and
+eyes predicts the skin's albedo, the values of `sira_mi.fit.skin`; `landmarks` measures the errors of detected landmarks
+and of the prior's landmarks, and writes the corrections of both.
 """
 
 import argparse
@@ -12,6 +12,8 @@ import time
 from pathlib import Path
 
 from sira_mi.errors import CommandParser, InputError, run_command
+from studies.cache import write_json
+from studies.data import read_figures, write_figures
 
 
 def main() -> None:
@@ -45,10 +47,12 @@ def main() -> None:
         "--out", type=Path, required=True, help="folder for prior.safetensors and head_landmarks.safetensors"
     )
     landmarks.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
-    fits = commands.add_parser("fit", help="fit the benchmark's portraits, score them, write the page")
+    fits = commands.add_parser("fit", help="fit the benchmark's portraits, score them, write figures and page")
     fits.add_argument("--benchmark", type=Path, required=True)
-    fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; those that are there are kept")
-    fits.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
+    fits.add_argument("--runs", type=Path, required=True, help="folder of the fits; finished ones are kept")
+    pages = commands.add_parser("page", help="write the page from its figures")
+    for command in (fits, pages):
+        command.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
     fits.add_argument("--quality", choices=("draft", "standard", "high"), default="standard", help="of the shipped fit")
     fits.add_argument(
         "--ablations", choices=("draft", "standard", "high"), default="draft", help="quality of all methods"
@@ -61,19 +65,26 @@ def main() -> None:
     fits.add_argument("--prior", type=Path, help="prior.safetensors (default: the shipped one)")
     fits.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     arguments = parser.parse_args()
-    run = {"build": make_benchmark, "skin": measure_skin, "landmarks": correct_landmarks, "fit": compare_fits}
+    run = {
+        "build": make_benchmark,
+        "fit": compare_fits,
+        "page": write_results,
+        "skin": print_skin_level,
+        "landmarks": correct_landmarks,
+    }
     run[arguments.command](arguments)
 
 
 def compare_fits(arguments: argparse.Namespace) -> None:
-    """Fits and scores the benchmark's portraits as the command line says, and writes the page."""
+    """Fits and scores the benchmark's portraits as the command line says; writes figures, picture and page."""
     import mitsuba as mi
 
     from sira_mi.avatar.file import PRIOR
-    from studies.cache import write_json
     from studies.portraits.compare_methods import Comparison, compare
     from studies.portraits.methods import BY_NAME
-    from studies.portraits.page import SHIPPED, Described, write_results
+    from studies.portraits.page import FIGURES
+    from studies.portraits.picture import write_picture
+    from studies.portraits.summary import SHIPPED, summarise
 
     mi.set_variant(arguments.variant)
 
@@ -94,14 +105,22 @@ def compare_fits(arguments: argparse.Namespace) -> None:
 
     ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
     shipped = rows(arguments.quality, (SHIPPED,))
-    described = Described(
-        arguments.benchmark, arguments.runs / arguments.quality, arguments.quality, arguments.ablations
-    )
-    print(f"{write_results(shipped, ablations, described, arguments.out)} written")
+    figures = summarise(shipped, ablations, arguments.quality, arguments.ablations)
+    write_figures(arguments.out / FIGURES, figures)
+    picture = arguments.out / "images" / "results.png"
+    write_picture(shipped, arguments.benchmark, arguments.runs / arguments.quality, picture)
+    write_results(arguments)
 
 
-def measure_skin(arguments: argparse.Namespace) -> None:
-    """Prints what the cues of `sira_mi.fit.skin` tell of the skin's albedo, over a benchmark's portraits."""
+def write_results(arguments: argparse.Namespace) -> None:
+    """Writes the page from its figures."""
+    from studies.portraits.page import FIGURES, write_page
+
+    print(f"{write_page(read_figures(arguments.out / FIGURES), arguments.out)} written")
+
+
+def print_skin_level(arguments: argparse.Namespace) -> None:
+    """Prints how well the cues of `sira_mi.fit.skin` predict the skin's albedo, over a benchmark's portraits."""
     import mitsuba as mi
     import numpy as np
 
@@ -117,7 +136,7 @@ def measure_skin(arguments: argparse.Namespace) -> None:
 
 
 def correct_landmarks(arguments: argparse.Namespace) -> None:
-    """Writes the correction of found faces and the prior with its model of landmarks; prints what each mends."""
+    """Writes the correction of detected landmarks and the prior with its landmark model; prints the errors of both."""
     import mitsuba as mi
 
     mi.set_variant(arguments.variant)

@@ -1,31 +1,78 @@
-"""`docs/results.md` from the rows of `compare_methods.compare`: marks, ablations, lights, portraits, pictures."""
+"""`docs/results.md` from the figures of `docs/data/portraits.json`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from PIL import Image
-
-from sira_mi.files import write_png, write_through
-from sira_mi.relight.pictures import preview
+from sira_mi.files import write_text
 from studies.markdown import number, table
-from studies.portraits import results_text
 from studies.portraits.compare_methods import MEAN_HEAD
-from studies.portraits.methods import BY_NAME
+from studies.portraits.summary import GEOMETRY_METHOD, SHIPPED
 
-SHIPPED = "b.3"
-GEOMETRY_ROWS = (MEAN_HEAD, "a.1", "a.2", "a.3", "a.4", "b.4")
-FIT_ROWS = (MEAN_HEAD, "a.4", SHIPPED)  # of the shipped fit's geometry, as a.4 and b.3 leave it
-APPEARANCE_ROWS = ("b.1", "b.2", "b.3", "b.4", "b.5", "b.6", "b.7")
-_TILE = 256  # pixels, side of a picture in the sheet
-_SHEET_PORTRAITS = 6
+FIGURES = Path("data") / "portraits.json"  # beside the page
 AT_MOST, AT_LEAST = "≤", "≥"
+
+PAGE = """# Results of the single-image fit
+
+{portraits} portraits of heads that no training has seen ([benchmark](benchmark.md)), fitted at `{quality}` quality. A
+fit gets the photo and its EXIF focal length; it estimates camera, mask and landmarks itself. Measured at revision
+`{revision}` on {date}; more columns and every portrait are in [data/portraits.json](data/portraits.json), what was
+tried is in the [notebook](notebook/portraits.md).
+
+    python -m studies.portraits build --collection COLLECTION --out BENCHMARK
+    python -m studies.portraits fit --benchmark BENCHMARK --runs RUNS
+
+## Marks
+
+{marks}
+
+## Geometry
+
+{geometry}
+
+Means over portraits, mm. `face`: skin and eyes within 95 mm of the nose tip, both directions, after alignment by six
+landmarks and ICP with scale (H3DS). `no ICP`: the same in the photo's camera frame, with one scale about the camera's
+centre. `hidden half`: what the photo does not show, hair included. `IoU` leaves out the body below the model's floor,
+30 cm under the ears. {geometry_method} is the geometry of the fit; {shipped} continues from it, and its shading stage
+moves the surface again where the quality has one.
+
+## Appearance
+
+{lights}
+
+PSNR and SSIM are of sRGB values inside the mask. `eq. 8` is the final render without the
+[refinement of the light](architecture.md#albedo-or-light): what albedo, light and shape explain by themselves. Specular
+albedo is the reflectance at normal incidence over 0.08. The last two rows are the extremes over portraits.
+
+## Ablations
+
+{ablations}
+
+All at `{ablation_quality}` quality; the b methods continue from {geometry_method} or from one another. `scaled` is
+after one least-squares factor per channel. `leakage` is the correlation of the log albedo's error on skin with the log
+of the light; 0 is none.
+
+## Limits
+
+- The heads are synthetic, neutral, with closed mouths. Nothing here measures expressions, glasses, hats or beards.
+- Region levels of the specular albedo are those that the prior was trained with: its scores tell how well regions are
+  found, not more.
+- The refinement of the light holds in the photo's own light. Under another light, `eq. 8` is what remains.
+- Differences below 0.05 mm on the face are chance at this number of portraits ([notebook](notebook/portraits.md)).
+- Times are wall-clock times of whole processes on two cores without a GPU.
+{failed}
+## Pictures
+
+Photo and fit; then fitted and true normals, diffuse albedo and specular albedo.
+
+![Photo, fit, and fitted and true normals and albedos](images/results.png)
+"""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One figure of a table: the mean over portraits of a score."""
+    """One score of a table."""
 
     title: str
     score: str
@@ -34,260 +81,181 @@ class Column:
 
 GEOMETRY_COLUMNS = (
     Column("face", "h3ds_face_mean"),
-    Column("truth → fit", "h3ds_face_truth_to_prediction_mean"),
-    Column("median", "h3ds_face_truth_to_prediction_median"),
-    Column("90%", "h3ds_face_truth_to_prediction_p90"),
-    Column("fit → truth", "h3ds_face_prediction_to_truth_mean"),
     Column("no ICP", "camera_face_mean"),
     Column("head", "h3ds_head_mean"),
     Column("hidden half", "h3ds_hidden_mean"),
     Column("normals, °", "normals_mean", 1),
     Column("IoU", "silhouette_iou", 3),
 )
-APPEARANCE_COLUMNS = (
+LIGHT_COLUMNS = (
+    Column("face, mm", "h3ds_face_mean"),
     Column("final, dB", "final_psnr", 1),
-    Column("SSIM", "final_ssim"),
     Column("eq. 8, dB", "shaded_psnr", 1),
     Column("diffuse, dB", "diffuse_psnr", 1),
-    Column("SSIM", "diffuse_ssim"),
-    Column("scaled, dB", "diffuse_scaled_psnr", 1),
     Column("specular, dB", "specular_psnr", 1),
-    Column("SSIM", "specular_ssim"),
-    Column("skin ΔE", "skin_ciede2000_mean", 1),
-    Column("scaled", "skin_scaled_ciede2000_mean", 1),
-    Column("leakage", "leakage_shading"),
-    Column("of shadows", "leakage_shadow"),
 )
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Rows by method: those of the shipped fit at the quality of the page, and all methods at that of the ablations."""
-
-    shipped: dict[str, list[dict]]
-    ablations: dict[str, list[dict]]
-
-
-@dataclass(frozen=True)
-class Described:
-    """Where the rows of a page come from."""
-
-    benchmark: Path
-    runs: Path  # folder of the shipped fits
-    quality: str  # of the shipped fits
-    ablations: str  # quality of the ablations
+ABLATION_COLUMNS = (
+    Column("final, dB", "final_psnr", 1),
+    Column("eq. 8, dB", "shaded_psnr", 1),
+    Column("diffuse, dB", "diffuse_psnr", 1),
+    Column("scaled, dB", "diffuse_scaled_psnr", 1),
+    Column("leakage", "leakage_shading"),
+)
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What the shipped fit has to reach."""
+    """A bound that the shipped fit has to meet."""
 
     title: str
     sign: str  # AT_MOST or AT_LEAST
     limit: float
-    score: Callable[[Measured], float]
+    value: Callable[[dict], float | None]  # of the figures
     digits: int = 2
 
-    def verdict(self, value: float) -> str:
-        """Whether `value` keeps the mark, and by how much it does not."""
-        if np.isnan(value):
-            return "–"
-        excess = value - self.limit if self.sign == AT_MOST else self.limit - value
-        return "reached" if excess <= 0 else f"**missed** by {number(excess, self.digits)}"
+    def is_met(self, value: float) -> bool:
+        return value <= self.limit if self.sign == AT_MOST else value >= self.limit
 
 
-def mean(rows: Sequence[dict], score: str) -> float:
-    """Mean of a score over rows; NaN when one of them has none."""
-    return float(np.mean([row["scores"][score] if "scores" in row else np.nan for row in rows])) if rows else np.nan
+def find(figures: dict, *path: str) -> Any:
+    """What stands at a path of keys; None where a key is missing."""
+    value: Any = figures
+    for key in path:
+        if key not in value:
+            return None
+        value = value[key]
+    return value
 
 
-def _shipped(score: str) -> Callable[[Measured], float]:
-    return lambda measured: mean(measured.shipped.get(SHIPPED, ()), score)
+def _of_fit(group: str, score: str) -> Callable[[dict], float | None]:
+    return lambda figures: find(figures, "shipped", "methods", SHIPPED, group, score)
 
 
-def _over_mean_head(measured: Measured) -> float:
-    rows = measured.shipped
-    return mean(rows.get(SHIPPED, ()), "h3ds_face_mean") / mean(rows.get(MEAN_HEAD, ()), "h3ds_face_mean")
+def _over_mean_head(figures: dict) -> float | None:
+    fit, mean = (
+        find(figures, "shipped", "methods", name, "geometry", "h3ds_face_mean") for name in (SHIPPED, MEAN_HEAD)
+    )
+    return None if fit is None or mean is None else fit / mean
 
 
-def _best_ablation(measured: Measured) -> float:
-    """Beside the methods that have rows; NaN where none has."""
-    others = [mean(rows, "h3ds_face_mean") for name in ("a.1", "a.2", "a.3") if (rows := measured.ablations.get(name))]
-    return mean(measured.ablations.get("a.4", ()), "h3ds_face_mean") - min(others, default=np.nan)
+def _gain_over_ablations(figures: dict) -> float | None:
+    """Of the fit's geometry over the best of the methods before it."""
+    methods = figures["ablations"]["methods"]
+    found = {name: find(methods, name, "geometry", "h3ds_face_mean") for name in methods if name.startswith("a.")}
+    own = found.pop(GEOMETRY_METHOD, None)
+    others = [value for value in found.values() if value is not None]
+    return None if own is None or not others else own - min(others)
 
 
-def _draft_face(measured: Measured) -> float:
-    return mean(measured.ablations.get(SHIPPED, ()), "h3ds_face_mean")
+def _draft_face(figures: dict) -> float | None:
+    """Of the shipped method, or of its geometry stages where nothing after them moves the shape."""
+    methods = figures["ablations"]["methods"]
+    if SHIPPED not in methods:
+        return None
+    last = SHIPPED if "geometry" in methods[SHIPPED] else GEOMETRY_METHOD
+    return find(methods, last, "geometry", "h3ds_face_mean")
 
 
-def seconds(rows: dict[str, list[dict]]) -> float:
-    """Median time of whole shipped fits: geometry and what goes on from it."""
-    geometry = {row["portrait"]: row["total_seconds"] for row in rows.get("a.4", ()) if "scores" in row}
-    both = [
-        geometry[row["portrait"]] + row["total_seconds"]
-        for row in rows.get(SHIPPED, ())
-        if "scores" in row and row["portrait"] in geometry
-    ]
-    return float(np.median(both)) if both else np.nan
-
-
-def _memory(measured: Measured) -> float:
-    rows = [row for name in ("a.4", SHIPPED) for row in measured.shipped.get(name, ()) if "scores" in row]
-    return max((row["peak_memory_megabytes"] / 1000 for row in rows), default=np.nan)
+def _gigabytes(figures: dict) -> float | None:
+    megabytes = find(figures, "shipped", "fit_megabytes")
+    return None if megabytes is None else megabytes / 1000
 
 
 MARKS = (
-    Mark("face, both directions, mm", AT_MOST, 1.0, _shipped("h3ds_face_mean")),
-    Mark("the same over the mean head's", AT_MOST, 0.7, _over_mean_head),
-    Mark("face in the photo's camera frame, no ICP, mm", AT_MOST, 1.5, _shipped("camera_face_mean")),
-    Mark("face normals, °", AT_MOST, 8, _shipped("normals_mean"), 1),
-    Mark("a.4 minus the best of a.1 to a.3, mm", AT_MOST, 0, _best_ablation),
-    Mark("silhouette IoU", AT_LEAST, 0.97, _shipped("silhouette_iou"), 3),
-    Mark("final render, dB", AT_LEAST, 34, _shipped("final_psnr"), 1),
-    Mark("final render, SSIM", AT_LEAST, 0.95, _shipped("final_ssim"), 3),
-    Mark("the same without the light's refinement, dB", AT_LEAST, 34, _shipped("shaded_psnr"), 1),
-    Mark("diffuse albedo, dB", AT_LEAST, 23, _shipped("diffuse_psnr"), 1),
-    Mark("diffuse albedo, SSIM", AT_LEAST, 0.88, _shipped("diffuse_ssim"), 3),
-    Mark("specular albedo, dB", AT_LEAST, 19.5, _shipped("specular_psnr"), 1),
-    Mark("specular albedo, SSIM", AT_LEAST, 0.71, _shipped("specular_ssim"), 3),
-    Mark("time of a fit, s", AT_MOST, 300, lambda measured: seconds(measured.shipped), 0),
-    Mark("its peak memory, GB", AT_MOST, 2, _memory, 1),
-    Mark("time of a draft, s", AT_MOST, 60, lambda measured: seconds(measured.ablations), 1),
+    Mark("face, mm", AT_MOST, 1.0, _of_fit("geometry", "h3ds_face_mean")),
+    Mark("over the mean head's", AT_MOST, 0.7, _over_mean_head),
+    Mark("face, no ICP, mm", AT_MOST, 1.5, _of_fit("geometry", "camera_face_mean")),
+    Mark("face normals, °", AT_MOST, 8, _of_fit("geometry", "normals_mean"), 1),
+    Mark(f"{GEOMETRY_METHOD} minus best ablation, mm", AT_MOST, 0, _gain_over_ablations),
+    Mark("silhouette IoU", AT_LEAST, 0.97, _of_fit("geometry", "silhouette_iou"), 3),
+    Mark("final render, dB", AT_LEAST, 34, _of_fit("appearance", "final_psnr"), 1),
+    Mark("final render, SSIM", AT_LEAST, 0.95, _of_fit("appearance", "final_ssim"), 3),
+    Mark("eq. 8 alone, dB", AT_LEAST, 34, _of_fit("appearance", "shaded_psnr"), 1),
+    Mark("diffuse albedo, dB", AT_LEAST, 23, _of_fit("appearance", "diffuse_psnr"), 1),
+    Mark("diffuse albedo, SSIM", AT_LEAST, 0.88, _of_fit("appearance", "diffuse_ssim"), 3),
+    Mark("specular albedo, dB", AT_LEAST, 19.5, _of_fit("appearance", "specular_psnr"), 1),
+    Mark("specular albedo, SSIM", AT_LEAST, 0.71, _of_fit("appearance", "specular_ssim"), 3),
+    Mark("fit, s", AT_MOST, 300, lambda figures: find(figures, "shipped", "fit_seconds"), 0),
+    Mark("peak memory, GB", AT_MOST, 2, _gigabytes, 1),
+    Mark("draft, s", AT_MOST, 60, lambda figures: find(figures, "ablations", "fit_seconds"), 1),
     Mark("face of a draft, mm", AT_MOST, 1.2, _draft_face),
 )
 
 
-def by_method(rows: Sequence[dict]) -> dict[str, list[dict]]:
-    """Rows by the name of their method, in the order of their first appearance."""
-    result: dict[str, list[dict]] = {}
-    for row in rows:
-        result.setdefault(row["method"], []).append(row)
-    return result
+def write_page(figures: dict, out: Path) -> Path:
+    """Writes `out/results.md`; returns its path."""
+    write_text(out / "results.md", render_page(figures))
+    return out / "results.md"
 
 
-def write_results(shipped: Sequence[dict], ablations: Sequence[dict], described: Described, out: Path) -> Path:
-    """Writes `results.md` and its picture to the folder `out`; returns the page."""
-    measured = Measured(by_method(shipped), by_method(ablations))
-    fits, methods = measured.shipped, measured.ablations
-    sections = [
-        results_text.INTRODUCTION.format(portraits=len(fits[MEAN_HEAD]), quality=described.quality),
-        "## Marks\n\n" + _marks(measured),
-        "## Geometry\n\n" + results_text.GEOMETRY + "\n\n" + _methods_table(fits, GEOMETRY_COLUMNS, FIT_ROWS),
-        "## Appearance\n\n" + results_text.APPEARANCE + "\n\n" + _methods_table(fits, APPEARANCE_COLUMNS, (SHIPPED,)),
-        results_text.ABLATIONS.format(quality=described.ablations)
-        + _methods_table(methods, GEOMETRY_COLUMNS, GEOMETRY_ROWS)
-        + "\n\n"
-        + _methods_table(methods, APPEARANCE_COLUMNS, APPEARANCE_ROWS),
-        "## By light\n\n" + _by_light(fits),
-        "## Every portrait\n\n" + _by_portrait(fits),
-        "## What brought the fit here\n\n" + _changes(),
-        results_text.TRIED,
-        f"## Time and memory\n\n{results_text.COSTS}\n\nAt `{described.quality}`:\n\n{_costs(fits)}\n\n"
-        f"At `{described.ablations}`:\n\n{_costs(methods)}",
-    ]
-    if errors := [row for row in (*shipped, *ablations) if "error" in row]:
-        lines = [[row["portrait"], row["method"], row["error"]] for row in errors]
-        sections.append("## Fits that failed\n\n" + table(("portrait", "method", "error"), lines))
-    shown = [row["portrait"] for row in fits.get(SHIPPED, ()) if "scores" in row][:_SHEET_PORTRAITS]
-    if shown:
-        write_png(out / "images" / "results.png", picture(shown, described.benchmark, described.runs))
-        sections.append(results_text.PICTURE)
-    page = out / "results.md"
-    write_through(page, lambda file: file.write_text("\n\n".join(sections) + "\n", encoding="utf-8"))
-    return page
+def render_page(figures: dict) -> str:
+    """The page's Markdown."""
+    shipped, ablations = figures["shipped"], figures["ablations"]
+    return PAGE.format(
+        portraits=figures["portraits"],
+        revision=figures["measured"]["revision"],
+        date=figures["measured"]["date"],
+        quality=shipped["quality"],
+        ablation_quality=ablations["quality"],
+        geometry_method=GEOMETRY_METHOD,
+        shipped=SHIPPED,
+        marks=_marks(figures),
+        geometry=table(
+            ("", "quality", *(c.title for c in GEOMETRY_COLUMNS)),
+            [*_geometry_rows(shipped), *(row for row in _geometry_rows(ablations) if row[0] != MEAN_HEAD)],
+        ),
+        lights=_lights(figures),
+        ablations=table(
+            ("", *(c.title for c in ABLATION_COLUMNS), "s"),
+            [
+                [f"{name} {method['title']}", *_cells(method["appearance"], ABLATION_COLUMNS), _seconds(method)]
+                for name, method in ablations["methods"].items()
+                if "appearance" in method
+            ],
+        ),
+        failed=_failed(figures["failed"]),
+    )
 
 
-def _changes() -> str:
-    tables = (table(head, lines) for head, *lines in (results_text.GEOMETRY_CHANGES, results_text.APPEARANCE_CHANGES))
-    return "\n\n".join((results_text.CHANGES, *tables))
+def _cells(scores: dict, columns: Sequence[Column]) -> list[str]:
+    return [number(scores.get(c.score), c.digits) for c in columns]
 
 
-def _marks(measured: Measured) -> str:
+def _seconds(method: dict) -> str:
+    return number(method.get("seconds"), 0)
+
+
+def _marks(figures: dict) -> str:
     lines = []
     for mark in MARKS:
-        value = mark.score(measured)
-        lines.append([mark.title, f"{mark.sign} {mark.limit:g}", number(value, mark.digits), mark.verdict(value)])
-    return table(("", "to reach", "measured", ""), lines)
+        value = mark.value(figures)
+        verdict = "–" if value is None else "met" if mark.is_met(value) else "**missed**"
+        lines.append([mark.title, f"{mark.sign} {mark.limit:g}", number(value, mark.digits), verdict])
+    return table(("", "wanted", "measured", ""), lines)
 
 
-def _title(method: str) -> str:
-    return method if method == MEAN_HEAD else f"{method} {BY_NAME[method].title}"
-
-
-def _methods_table(methods: dict, columns: Sequence[Column], names: Sequence[str]) -> str:
-    lines = [
-        [_title(name), *(number(mean(methods[name], c.score), c.digits) for c in columns)]
-        for name in names
-        if name in methods
+def _geometry_rows(quality: dict) -> list[list[str]]:
+    return [
+        [f"{name} {method['title']}".strip(), quality["quality"], *_cells(method["geometry"], GEOMETRY_COLUMNS)]
+        for name, method in quality["methods"].items()
+        if "geometry" in method
     ]
-    return table(("", *(c.title for c in columns)), lines)
 
 
-def _by_light(methods: dict) -> str:
-    columns = (*GEOMETRY_COLUMNS[:1], *GEOMETRY_COLUMNS[5:6], *GEOMETRY_COLUMNS[8:], *APPEARANCE_COLUMNS)
-    rows = methods.get(SHIPPED, [])
-    lights = sorted({row["light"] for row in rows})
-    lines = [
-        [light, *(number(mean([r for r in rows if r["light"] == light], c.score), c.digits) for c in columns)]
-        for light in lights
-    ]
-    return table(("b.3", *(c.title for c in columns)), lines)
+def _lights(figures: dict) -> str:
+    """Rows of the shipped fit: all portraits, each light, and the smallest and largest value over portraits."""
+    fit = find(figures, "shipped", "methods", SHIPPED) or {}
+    everywhere = {**fit.get("geometry", {}), **fit.get("appearance", {})}
+    lines = [["all", *_cells(everywhere, LIGHT_COLUMNS)]]
+    lines += [[light, *_cells(scores, LIGHT_COLUMNS)] for light, scores in figures["lights"].items()]
+    for title, choose in (("smallest", min), ("largest", max)):
+        known = {c.score: [v for row in figures["each"] if (v := row.get(c.score)) is not None] for c in LIGHT_COLUMNS}
+        lines.append([title, *_cells({s: choose(v) for s, v in known.items() if v}, LIGHT_COLUMNS)])
+    return table(("light", *(c.title for c in LIGHT_COLUMNS)), lines)
 
 
-def _by_portrait(methods: dict) -> str:
-    heads = {row["portrait"]: row for row in methods[MEAN_HEAD]}
-    lines = []
-    for row in methods.get(SHIPPED, []):
-        if "scores" in row:
-            scores, mean_head = row["scores"], heads[row["portrait"]]["scores"]
-            lines.append(
-                [
-                    row["portrait"],
-                    number(mean_head["h3ds_face_mean"]),
-                    *(number(scores[c.score], c.digits) for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]),
-                    *(number(scores[c.score], c.digits) for c in APPEARANCE_COLUMNS[:8]),
-                ]
-            )
-    titles = [c.title for c in GEOMETRY_COLUMNS[:1] + GEOMETRY_COLUMNS[5:]] + [c.title for c in APPEARANCE_COLUMNS[:8]]
-    return table(("b.3", "mean head", *titles), lines)
-
-
-def _costs(methods: dict) -> str:
-    lines = []
-    for name, rows in methods.items():
-        done = [row for row in rows if "seconds" in row]
-        if done:
-            stages = {stage: np.median([row["seconds"].get(stage, 0) for row in done]) for stage in done[0]["seconds"]}
-            shown = ", ".join(f"{stage} {value:.0f}" for stage, value in stages.items())
-            total = np.median([row["total_seconds"] for row in done])
-            memory = np.median([row["peak_memory_megabytes"] for row in done])
-            lines.append([_title(name), f"{total:.0f}", shown, f"{memory:.0f}"])
-    return table(("median over portraits", "s", "stages, s", "peak, MB"), lines)
-
-
-def picture(portraits: Sequence[str], benchmark: Path, runs: Path) -> np.ndarray:
-    """Display values: a row for each portrait, the photo, then fitted and true final render, normals, diffuse and
-    specular albedo side by side."""
-    return np.concatenate([_picture_row(benchmark / name, runs / name / "b.3") for name in portraits])
-
-
-def _picture_row(folder: Path, fit: Path) -> np.ndarray:
-    with np.load(folder / "truth.npz", allow_pickle=False) as truth:
-        names = ("normal", "diffuse_albedo", "specular_albedo")
-        true = {name: truth[name] for name in (*names, "mask")}
-        turn = truth["world_to_camera"][:3, :3]
-        true["normal"] = true["normal"] @ turn.T * [1, -1, -1]
-    with np.load(fit / "head.npz", allow_pickle=False) as head:
-        own = {name: head[f"image/{name}"] for name in (*names, "final", "mask")}
-        own["normal"] = own["normal"] @ head["world_to_camera"][:3, :3].T * [1, -1, -1]
-    photo = np.asarray(Image.open(folder / "photo.jpg").convert("RGB")) / 255
-    shown = [photo, preview("final", own["final"], own["mask"])]
-    for name in names:
-        shown += [preview(name, layers[name], layers["mask"]) for layers in (own, true)]
-    return np.concatenate([_tile(image) for image in shown], axis=1)
-
-
-def _tile(image: np.ndarray) -> np.ndarray:
-    image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-    pixels = Image.fromarray((np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8))
-    return np.asarray(pixels.resize((_TILE, _TILE), Image.LANCZOS)) / 255
+def _failed(failed: Sequence[dict]) -> str:
+    if not failed:
+        return ""
+    lines = [[row["portrait"], row["method"], row["error"]] for row in failed]
+    return "\n## Fits that failed\n\n" + table(("portrait", "method", "error"), lines) + "\n"
