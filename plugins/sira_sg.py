@@ -1,3 +1,8 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,11 +18,16 @@ from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 from sira_mi.plugins.neural_sdf import find_head, trace_head
 from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
-from sira_mi.sg import multisampling, visibility
-from sira_mi.sg.radiance import Material, reflected_radiance
-
-# Rows of the columns that are computed at a hit, in order.
-_ROWS = {"diffuse": 3, "specular": 3, "diffuse_albedo": 3, "specular_albedo": 1, "normal": 3}
+from sira_mi.sg.layers import EXTRA_LAYERS, channel_count, extra_channel_names
+from sira_mi.sg.multisampling import representative_samples
+from sira_mi.sg.radiance import Material, Radiance, reflected_radiance
+from sira_mi.sg.visibility import (
+    SHADOW_OFFSET,
+    Directions,
+    light_directions,
+    light_visibility,
+    trace_unoccluded,
+)
 
 
 class SiraSG(mi.SamplingIntegrator):
@@ -34,50 +44,49 @@ class SiraSG(mi.SamplingIntegrator):
        - Show black instead of the environment behind the head. (Default: false)
      * - visibility
        - |bool|
-       - Multiply the closed form by the share of the light that is not blocked, and add one diffuse bounce off what
-         blocks it. (Default: true)
+       - Shadows, and one diffuse bounce off the surfaces that cast them. (Default: true)
      * - visibility_directions
        - |int|
-       - Directions of that share, 16 to 4096. (Default: 64)
+       - Directions in which visibility is tested, 16 to 4096. (Default: 64)
      * - aovs
        - |bool|
-       - Give the extra channels. (Default: true)
+       - Render the extra channels. (Default: true)
      * - exact
        - |bool|
-       - Hits and normals of the field. Without it those of the mesh, and albedos from its vertices where a texture is
-         baked: quicker, and as good as the shape's `voxel` is fine. (Default: true)
+       - Use hits and normals of the field. If false, use those of the mesh, and the albedos of its vertices where a
+         texture is baked: faster, but only as accurate as the shape's `voxel` is small. (Default: true)
      * - shared
        - |bool|
-       - Samples of one pixel that all see the head within 4 mm of the field, with normals within 15 degrees, are shaded
-         once, at the one in their middle; what the head covers is still found by the sample. (Default: false)
+       - Shade a pixel once, at its middle sample, where all its samples hit the head within 4 mm of each other and with
+         normals within 15 degrees. Coverage is still computed for every sample. (Default: false)
      * - light_refinement
        - |string|
-       - An `avatar.safetensors` whose refinement of the light the radiance is multiplied by: of what the photo shows
-         and eq. 8 does not, the part that is not the person's albedo. It holds in the fitted light of that avatar
-         alone. An avatar without one has 1 everywhere. (Default: empty, no refinement)
+       - An `avatar.safetensors` whose light refinement multiplies the radiance: the part of the photo that neither
+         eq. 8 nor the albedo explains. It is only valid under that avatar's fitted light. (Default: none)
      * - shaded_lobes
        - |tensor|
-       - Numbers of the lobes that the closed form sums up; `visibility` is that of all lobes. (Default: all)
+       - Indices of the lobes that the closed form sums over. Visibility always uses all lobes. (Default: all)
 
-    Eq. 8 in closed form: the radiance that a `neural_sdf` with a `sira_bsdf` reflects under an `sg_envmap`, without
-    sampling and without noise. Shadows come from rays against the scene's meshes in a fixed set of directions, half of
-    them spread evenly, half drawn from the lobes; interreflection is one bounce off surfaces that are taken to face the
-    point and to have its albedo. `path` renders the same scene with both in full.
-    Albedos that are `neural_albedo` textures are evaluated as networks in tensor mode; any other texture is asked at
-    the hit. Other shapes only occlude.
+    Evaluates eq. 8 in closed form, without sampling and without noise: the radiance that a `neural_sdf` with a
+    `sira_bsdf` reflects under an `sg_envmap`. To find shadows, rays are traced against the scene's meshes in a fixed
+    set of directions. Half of them are evenly spread, half follow the lobes. Interreflection is one bounce off
+    surfaces that are assumed to face the point and to share its albedo; `path` renders the same scene without these
+    approximations. Albedos that are `neural_albedo` textures are evaluated as networks, in tensor mode; other textures
+    are evaluated at the hit. Other shapes only occlude.
 
-    Where k_s is 0 and not differentiated, the specular part is not computed.
+    The extra channels are `diffuse.RGB` and `specular.RGB` (the two terms of eq. 8, without `light_refinement`),
+    `diffuse_albedo.RGB`, `specular_albedo`, `normal.XYZ` (of the field, in world space), `depth` (distance along the
+    ray from the sensor's near plane in scene units, as in `aov`) and `mask` (1 on the head). All are zero off the head.
 
-    Extra channels: `diffuse.RGB` and `specular.RGB` (r^d and k_s r^s, without `light_refinement`),
-    `diffuse_albedo.RGB`, `specular_albedo`, `normal.XYZ` (world, of the field), `depth` (along the ray from the
-    sensor's near plane, as of `aov`, in scene units) and `mask` (1 on the head). All are zero off the head.
+    Differentiable in every parameter of the head, its material and its light: lobes and their scale, albedo networks,
+    latents and textures, k_s, k_r and roughness and, by implicit differentiation, the shape's networks, latent and
+    pose. Derivatives of the shape are those inside the silhouette; for silhouettes see `sira_radiance` and Mitsuba's
+    projective integrators. Visibility and the directions in which it is tested are constants. If any parameter has
+    gradients enabled, hits are exact, each sample is shaded on its own and all lobes are summed, whatever the options
+    say. The specular term is skipped only if k_s is 0 and no gradient is needed.
 
-    Where something is differentiated, hits are exact, every sample has its own shading and all lobes are summed up,
-    whatever the options say. Differentiable in everything that the scene exposes: lobes, albedo networks and latents,
-    k_s and k_r, and, through implicit differentiation, the shape's latent and networks (interior derivatives; for
-    silhouettes see `sira_radiance` and the stock projective integrators). What blocks the light, and the directions in
-    which that is tested, count as constants. Cannot be nested in symbolic code. Derivatives repeat bit for bit, but for
-    those of lobes through a background that is shown, which the emitter sums by atomics.
+    Not available inside symbolic code. Derivatives are the same bits on every run, except those of the lobes through a
+    visible background and those of textures other than `neural_albedo`, which are summed by atomics.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.3; PhySG (Zhang et al. 2021).
 
@@ -97,10 +106,11 @@ class SiraSG(mi.SamplingIntegrator):
         self.aovs = bool(props.get("aovs", True))
         self.exact = bool(props.get("exact", True))
         self.shared = bool(props.get("shared", False))
-        self.refinement = light_refinement_of(find_avatar(props, "light_refinement"))
+        self.refinement = read_refinement(find_avatar(props, "light_refinement"))
         self.shaded_lobes = np.array(props["shaded_lobes"]).astype(int) if "shaded_lobes" in props else None
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
+        # Scene: one head, its material and its light.
         head = find_head(scene, "sira_sg")
         bsdf, light = head.bsdf(), scene.environment()
         if not isinstance(bsdf, SiraBSDF):
@@ -109,170 +119,219 @@ class SiraSG(mi.SamplingIntegrator):
             raise RuntimeError("sira_sg: the environment must be an sg_envmap; use path for other lights")
         ray = mi.Ray3f(ray)
         width = dr.width(ray.o, ray.d)
-        attached = dr.grad_enabled(*differentiable_arrays(head, bsdf, light), ray.o, ray.d)
-        samples = sampler.sample_count() if self.shared and sampler is not None and not attached else 1
-        shared = samples > 1 and width % samples == 0
-        surface_hits = leader = None
-        if attached or (self.exact and not shared):
-            t, hit = trace_head(scene, head, ray, active)
-        else:
-            surface_hits, hit = mesh_hits(scene, head, ray, active)
-            t, shaded = surface_hits.t, hit
-            if shared:
-                arrays = (head.to_local @ surface_hits.p, surface_hits.sh_frame.n, hit)
-                leader = mi.UInt32(multisampling.leaders(*(a.numpy() for a in arrays), samples))
-                shaded = hit & (leader == dr.arange(mi.UInt32, width))
-            t, hit = head.refine(ray, t, shaded) if self.exact else (t, shaded)
+        attached = dr.grad_enabled(ray.o, ray.d) or has_gradients(head, light)
 
+        # Hits: where the rays meet the head, and which of them are shaded.
+        samples = sampler.sample_count() if self.shared and sampler is not None and not attached else 1
+        samples = samples if width % samples == 0 else 1
+        hits = find_hits(scene, head, ray, active, samples, exact=attached or self.exact)
+
+        # Shading: eq. 8 and the extra channels in tensors, one column a shaded ray.
+        index = dr.compress(hits.shaded)
+        columns = None
+        if dr.width(index) > 0:
+            shader = HeadShader(self, scene, head, light, attached)
+            columns = (
+                shader.shade_mesh(ray, hits, index) if hits.on_mesh is not None else shader.shade(ray, hits, index)
+            )
+
+        # Scatter: from the columns back to the rays.
+        parts, row = {}, 0
+        for name, rows in self.rows().items():
+            kind = mi.Color3f if rows == 3 else mi.Float
+            part = dr.zeros(kind, width)
+            if columns is not None:
+                part = scatter_columns(columns[row : row + rows, :], index, width, kind)
+            parts[name] = hits.spread(part)
+            row += rows
+        t, hit = hits.spread(hits.t), hits.spread(hits.shaded)
+        radiance = parts["diffuse"] + parts["specular"]
+        if self.refinement is not None:
+            radiance *= parts["light_refinement"]
+
+        # Background, and what the film takes.
         background = dr.zeros(mi.Color3f, width)
         if not self.hide_environment:
             si = dr.zeros(mi.SurfaceInteraction3f, width)
             si.wi = -ray.d
             background = light.eval(si, active & ~hit)
-        index = dr.compress(hit)
-        rows_of = _ROWS if self.aovs else {name: _ROWS[name] for name in ("diffuse", "specular")}
-        if self.refinement is not None:
-            rows_of = {**rows_of, "light": 3}
-        kinds = {name: mi.Color3f if rows == 3 else mi.Float for name, rows in rows_of.items()}
-        parts = {name: dr.zeros(kind, width) for name, kind in kinds.items()}
-        if dr.width(index) > 0:
-            on_mesh = None if attached or self.exact else dr.gather(mi.SurfaceInteraction3f, surface_hits, index)
-            columns = self._shade(scene, head, bsdf, light, ray, t, index, attached, on_mesh)
-            row = 0
-            for name, rows in rows_of.items():
-                parts[name] = scatter_columns(columns[row : row + rows, :], index, width, kinds[name])
-                row += rows
-        if leader is not None:
-            t, hit = dr.gather(mi.Float, t, leader), dr.gather(mi.Bool, hit, leader)
-            parts = {name: dr.gather(kinds[name], part, leader) for name, part in parts.items()}
-        radiance = parts["diffuse"] + parts["specular"]
-        if self.refinement is not None:
-            radiance *= parts["light"]
         color = dr.select(hit, radiance, background)
         valid = active & (hit | (not self.hide_environment))
         if not self.aovs:
             return color, valid, []
-        depth = dr.select(hit, t, 0.0)
-        aovs = [
-            *parts["diffuse"],
-            *parts["specular"],
-            *parts["diffuse_albedo"],
-            parts["specular_albedo"],
-            *parts["normal"],
-            depth,
-            dr.select(hit, mi.Float(1.0), 0.0),
-        ]
-        return color, valid, aovs
+        parts |= {"depth": dr.select(hit, t, 0.0), "mask": dr.select(hit, mi.Float(1.0), 0.0)}
+        return (
+            color,
+            valid,
+            [c for name in EXTRA_LAYERS for c in (parts[name] if EXTRA_LAYERS[name] else [parts[name]])],
+        )
 
-    def _shade(self, scene, head, bsdf, light, ray, t, index, attached, on_mesh):
-        """All of `_ROWS` at the hits `index`, as one tensor [13, n], or the radiances [6, n] without extra channels,
-        and the factor [3, n] of the light's refinement, if there is one; in chunks when nothing is differentiated.
-        `on_mesh` are the interactions with the mesh, None where hits are exact."""
-        field = head.field()
-        local = head.to_local @ ray
-        origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
-        lobes = all_lobes = local_lobes(light, head)
-        if not attached:
-            lobes = self._shaded(lobes)
-        speculars = attached or bsdf.k_s.numpy().item() != 0
-        k_s = mi.TensorXf(bsdf.k_s, (1, 1))
-        rotation = mi.TensorXf(rotation_of(head.to_world))
-
-        def albedo(texture, x, x_ref, gamma, rows):
-            if isinstance(texture, NeuralAlbedo):
-                return texture.evaluate_columns(x_ref, gamma)[0:rows, :]
-            si = dr.zeros(mi.SurfaceInteraction3f, x.shape[1])
-            si.p = head.to_world @ from_columns(x, mi.Point3f)
-            value = texture.eval(si) if rows == 3 else texture.eval_1(si)
-            return to_columns(value + dr.zeros(mi.Float, x.shape[1]))
-
-        if self.visibility:
-            directions = visibility.light_directions(dr.detach(all_lobes).numpy(), self.directions)
-
-        def radiances(x, normal, view, diffuse, specular):
-            material = Material(diffuse, specular if speculars else None, bsdf.roughness, k_s)
-            if not self.visibility:
-                return reflected_radiance(normal, view, material, lobes)
-            unoccluded = unoccluded_directions(scene, head, x, normal, directions)
-            visible = visibility.light_visibility(
-                normal, view, material.specular_albedo, bsdf.roughness, all_lobes, directions, unoccluded
-            )
-            return reflected_radiance(normal, view, material, lobes, visible)
-
-        def columns(x, direction):
-            _, gradient, x_ref, gamma = surface(field, x)
-            diffuse = albedo(bsdf.diffuse_albedo, x, x_ref, gamma, 3)
-            specular = albedo(bsdf.specular_albedo, x, x_ref, gamma, 1) if speculars or self.aovs else None
-            refined = [] if self.refinement is None else [self._light(x_ref, gamma)]
-            return shaded(x, direction, normalise(gradient), diffuse, specular, *refined)
-
-        def shaded(x, direction, normal, diffuse, specular, *refined):
-            radiance = radiances(x, normal, normalise(direction), diffuse, specular)
-            extra = (diffuse, specular, rotation @ normal) if self.aovs else ()
-            return dr.concat([*radiance, *extra, *refined], axis=0)
-
-        if on_mesh is not None:
-            inverse = mi.TensorXf(np.ascontiguousarray(rotation_of(head.to_world).T))
-            x, normal = to_columns(head.to_local @ on_mesh.p), inverse @ to_columns(on_mesh.sh_frame.n)
-            at_mesh = [x, direction, normal, *mesh_albedos(head, bsdf, on_mesh, x)]
-            if self.refinement is not None:
-                factor = evaluate_in_chunks(lambda p: self._light(*deform(field, p)), x.numpy())[0]
-                at_mesh.append(mi.TensorXf(factor))
-            return mi.TensorXf(evaluate_in_chunks(shaded, *(a.numpy() for a in at_mesh))[0])
-        if not attached:
-            x = on_ray(origin, direction, parameter)
-            return mi.TensorXf(evaluate_in_chunks(columns, x.numpy(), direction.numpy())[0])
-        parameter = dr.detach(parameter)
-        return columns(differentiable_hit(field, origin, direction, parameter), direction)
-
-    def _light(self, x_ref, gamma):
-        """The factor [3, N] of the light's refinement."""
-        network, octaves = self.refinement
-        return dr.exp(light_refinement(network, octaves, x_ref, gamma))
-
-    def _shaded(self, lobes):
-        """Those of `lobes` [N_l, 7] that the closed form sums up."""
-        if self.shaded_lobes is None:
-            return lobes
-        count = lobes.shape[0]
-        if not (len(self.shaded_lobes) and ((self.shaded_lobes >= 0) & (self.shaded_lobes < count)).all()):
-            raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
-        return mi.TensorXf(np.ascontiguousarray(lobes.numpy()[self.shaded_lobes]))
+    def rows(self) -> dict[str, int]:
+        """Rows of the tensor that `HeadShader` gives, by layer."""
+        names = ["diffuse", "specular", *(("diffuse_albedo", "specular_albedo", "normal") if self.aovs else ())]
+        refinement = {} if self.refinement is None else {"light_refinement": 3}
+        return {name: channel_count(name) for name in names} | refinement
 
     def aov_names(self):
-        if not self.aovs:
-            return []
-        names = []
-        for name, channels in (("diffuse", "RGB"), ("specular", "RGB"), ("diffuse_albedo", "RGB")):
-            names += [f"{name}.{c}" for c in channels]
-        return [*names, "specular_albedo", *(f"normal.{c}" for c in "XYZ"), "depth", "mask"]
+        return extra_channel_names() if self.aovs else []
 
     def to_string(self):
         return f"SiraSG[hide_emitters = {self.hide_environment}, visibility = {self.visibility}]"
 
 
-def light_refinement_of(path: str) -> tuple | None:
-    """Layers of the network of an avatar file that refines the light, and the octaves of its encoding; None without
-    a path and where the avatar has none."""
+def has_gradients(*objects: mi.Object) -> bool:
+    """Whether gradients are enabled for a parameter that one of the objects, or one nested in it, exposes."""
+    return any(dr.grad_enabled(value) for one in objects for _, value in mi.traverse(one))
+
+
+class LightRefinement(NamedTuple):
+    """The network of an avatar that refines its light."""
+
+    network: list[tuple]
+    octaves: int
+
+    def factor(self, x_ref, gamma):
+        """What the radiance is multiplied by [3, N], at points of the reference space."""
+        return dr.exp(light_refinement(self.network, self.octaves, x_ref, gamma))
+
+
+def read_refinement(path: str) -> LightRefinement | None:
+    """The light refinement of an avatar file; None without a path and where the avatar has none."""
     avatar = load_avatar(path) if path else None
     if avatar is None or "light_refinement" not in avatar.tensors:
         return None
     network = avatar.architecture.networks["light_refinement"]
-    return layers(network, mi.Float(avatar.tensors["light_refinement"])), avatar.architecture.refinement_octaves
+    parameters = mi.Float(avatar.tensors["light_refinement"])
+    return LightRefinement(layers(network, parameters), avatar.architecture.refinement_octaves)
 
 
-def mesh_hits(scene, head, ray, active):
-    """Interactions of `ray` with the scene's meshes, and whether they are with the head's."""
+# Hits
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where rays meet the head, one lane a ray."""
+
+    t: mi.Float  # along the ray
+    shaded: mi.Bool  # whether the ray meets the head and is shaded
+    on_mesh: mi.SurfaceInteraction3f | None = None  # interactions with the mesh; None where hits are exact
+    representative: mi.UInt32 | None = None  # the ray whose shading each ray takes; None: its own
+
+    def spread(self, value):
+        """A value of the shaded rays, at every ray that they represent."""
+        return value if self.representative is None else dr.gather(type(value), value, self.representative)
+
+
+def find_hits(scene, head, ray, active, samples: int, exact: bool) -> Hits:
+    """Hits of the rays on the head, on its field (`exact`) or on its mesh. With `samples` > 1, that many consecutive
+    rays are a pixel and share a shading where they may."""
+    if samples == 1 and exact:
+        return Hits(*trace_head(scene, head, ray, active))
     with dr.suspend_grad():
         si = scene.ray_intersect(ray, active)
-        hit = active & si.is_valid() & (si.shape == mi.ShapePtr(head))
-        dr.eval(si, hit)
-        return si, hit
+        shaded = active & si.is_valid() & (si.shape == mi.ShapePtr(head))
+        dr.eval(si, shaded)
+    representative = None
+    if samples > 1:
+        arrays = (head.to_local @ si.p, si.sh_frame.n, shaded)
+        representative = mi.UInt32(representative_samples(*(a.numpy() for a in arrays), samples))
+        shaded &= representative == dr.arange(mi.UInt32, dr.width(shaded))
+    if exact:
+        return Hits(*head.refine(ray, si.t, shaded), None, representative)
+    return Hits(si.t, shaded, si, representative)
+
+
+# Shading
+
+
+class HeadShader:
+    """Eq. 8 and the extra channels at points of a head, as tensors in its field's coordinates, one column a point.
+
+    Results have the rows of `SiraSG.rows`. Without gradients (`attached`) points are evaluated in chunks."""
+
+    def __init__(self, integrator: SiraSG, scene, head, light, attached: bool):
+        self.integrator, self.scene, self.head, self.attached = integrator, scene, head, attached
+        self.bsdf, self.field = head.bsdf(), head.field()
+        self.specular_term = attached or self.bsdf.k_s.numpy().item() != 0
+        self.lobes = local_lobes(light, head)
+        self.shaded_lobes = self.lobes if attached else self._select_lobes()
+        self.directions: Directions | None = None
+        if integrator.visibility:
+            self.directions = light_directions(dr.detach(self.lobes).numpy(), integrator.directions)
+        self.to_world = mi.TensorXf(rotation_of(head.to_world))
+
+    def shade(self, ray, hits: Hits, index):
+        """At the exact hits of the rays `index`."""
+        local = self.head.to_local @ ray
+        origin, direction, t = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, hits.t))
+        if self.attached:
+            return self._shade_field(differentiable_hit(self.field, origin, direction, dr.detach(t)), direction)
+        x = on_ray(origin, direction, t)
+        return mi.TensorXf(evaluate_in_chunks(self._shade_field, x.numpy(), direction.numpy())[0])
+
+    def shade_mesh(self, ray, hits: Hits, index):
+        """At the hits on the mesh of the rays `index`, with its normals; without gradients."""
+        si = dr.gather(mi.SurfaceInteraction3f, hits.on_mesh, index)
+        to_local = mi.TensorXf(np.ascontiguousarray(rotation_of(self.head.to_world).T))
+        local = dr.gather(mi.Vector3f, (self.head.to_local @ ray).d, index)
+        x, normal = to_columns(self.head.to_local @ si.p), to_local @ to_columns(si.sh_frame.n)
+        columns = [x, to_columns(local), normal, *mesh_albedos(self.head, self.bsdf, si, x)]
+        if (refinement := self.integrator.refinement) is not None:
+            factor = evaluate_in_chunks(lambda p: refinement.factor(*deform(self.field, p)), x.numpy())[0]
+            columns.append(mi.TensorXf(factor))
+        return mi.TensorXf(evaluate_in_chunks(self._shade_points, *(c.numpy() for c in columns))[0])
+
+    def _shade_field(self, x, direction):
+        """Points x [3, N] of the field's surface, seen along `direction` [3, N]."""
+        _, gradient, x_ref, gamma = surface(self.field, x)
+        diffuse = self._albedo(self.bsdf.diffuse_albedo, x, x_ref, gamma, 3)
+        specular = None
+        if self.specular_term or self.integrator.aovs:
+            specular = self._albedo(self.bsdf.specular_albedo, x, x_ref, gamma, 1)
+        refinement = self.integrator.refinement
+        factor = [] if refinement is None else [refinement.factor(x_ref, gamma)]
+        return self._shade_points(x, direction, normalise(gradient), diffuse, specular, *factor)
+
+    def _shade_points(self, x, direction, normal, diffuse, specular, *factor):
+        """Points whose unit normals and albedos are known."""
+        radiance = self._radiance(x, normal, normalise(direction), diffuse, specular)
+        extra = (diffuse, specular, self.to_world @ normal) if self.integrator.aovs else ()
+        return dr.concat([*radiance, *extra, *factor], axis=0)
+
+    def _radiance(self, x, normal, view, diffuse, specular) -> Radiance:
+        bsdf = self.bsdf
+        specular = specular if self.specular_term else None
+        material = Material(diffuse, specular, bsdf.roughness, mi.TensorXf(bsdf.k_s, (1, 1)))
+        visibility = None
+        if self.directions is not None:
+            unoccluded = unoccluded_directions(self.scene, self.head, x, normal, self.directions)
+            visibility = light_visibility(
+                normal, view, specular, bsdf.roughness, self.lobes, self.directions, unoccluded
+            )
+        return reflected_radiance(normal, view, material, self.shaded_lobes, visibility)
+
+    def _albedo(self, texture, x, x_ref, gamma, rows: int):
+        """The albedo [rows, N] of a texture at points x, which lie at x_ref in reference space."""
+        if isinstance(texture, NeuralAlbedo):
+            return texture.evaluate_columns(x_ref, gamma)[0:rows, :]
+        si = dr.zeros(mi.SurfaceInteraction3f, x.shape[1])
+        si.p = self.head.to_world @ from_columns(x, mi.Point3f)
+        value = texture.eval(si) if rows == 3 else texture.eval_1(si)
+        return to_columns(value + dr.zeros(mi.Float, x.shape[1]))
+
+    def _select_lobes(self):
+        """The lobes [N_l, 7] that the closed form sums over."""
+        chosen, count = self.integrator.shaded_lobes, self.lobes.shape[0]
+        if chosen is None:
+            return self.lobes
+        if not (len(chosen) and ((chosen >= 0) & (chosen < count)).all()):
+            raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
+        return mi.TensorXf(np.ascontiguousarray(self.lobes.numpy()[chosen]))
 
 
 def mesh_albedos(head, bsdf, si, x) -> list:
-    """Diffuse [3, N] and specular albedo [1, N] at interactions `si` with the head's mesh, whose places are x [3, N] in
-    the field's coordinates: baked ones and those of other textures as they are asked for at `si`, else by networks."""
+    """Diffuse [3, N] and specular albedo [1, N] at interactions `si` with the head's mesh, at x [3, N] in the field's
+    coordinates: of the networks, or looked up at `si` where a texture is baked or of another kind."""
     textures = (bsdf.diffuse_albedo, bsdf.specular_albedo)
     by_network = [isinstance(texture, NeuralAlbedo) and not texture.baked for texture in textures]
     inputs = evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy()) if any(by_network) else None
@@ -289,22 +348,13 @@ def mesh_albedos(head, bsdf, si, x) -> list:
 
 
 def unoccluded_directions(scene, head, x, normal, directions):
-    """Which of `directions`, in the field's coordinates, no surface of the scene blocks at surface points and normals
-    [3, N] of the field: tensor [K, N] of 0 and 1, without gradients."""
+    """Whether nothing in the scene blocks each of `directions`, given in the field's coordinates, at surface points and
+    normals [3, N] of the field: tensor [K, N] of 0 and 1, without gradients."""
     rotation = rotation_of(head.to_world)
     point = (head.to_world @ from_columns(dr.detach(x), mi.Point3f)).numpy()
-    offset = visibility.SHADOW_OFFSET * head.voxel * scale_of(head.to_world)
+    offset = SHADOW_OFFSET * head.voxel * scale_of(head.to_world)
     normal = rotation @ dr.detach(normal).numpy()
-    return mi.TensorXf(
-        visibility.trace_unoccluded(scene, point, normal, directions.axis @ rotation.T, offset).astype(np.float32)
-    )
-
-
-def differentiable_arrays(head, bsdf, light) -> list:
-    """Every array of the head, its material and its light that a gradient may be asked of."""
-    textures = [t for t in (bsdf.diffuse_albedo, bsdf.specular_albedo) if isinstance(t, NeuralAlbedo)]
-    own = [p for t in textures for p in (t.weights, t.latent, t.refinement, t.k_r)]
-    return [*head.parameters.values(), bsdf.k_s, bsdf.roughness, light.lobes, light.scale, *own]
+    return mi.TensorXf(trace_unoccluded(scene, point, normal, directions.axis @ rotation.T, offset).astype(np.float32))
 
 
 def local_lobes(light, head):

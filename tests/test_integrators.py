@@ -443,3 +443,61 @@ def test_orbiting_turns_the_view_about_the_vertical_axis():
     turned = scenes.orbit(camera(36), 90.0)
     np.testing.assert_allclose(turned.centre, [-5, 0, 0], atol=1e-9)
     np.testing.assert_allclose(scenes.orbit(camera(36), 0.0).centre, [0, 0, 5], atol=1e-9)
+
+
+# Every parameter alone
+
+PLAIN_PARAMETERS = [
+    "light.lobes",
+    "light.scale",
+    "head.bsdf.diffuse_albedo.value",
+    "head.bsdf.specular_albedo.value",
+    "head.bsdf.k_s",
+    "head.bsdf.roughness",
+    "head.deformation",
+    "head.reference",
+    "head.z_sdf",
+    "head.pose",
+]
+# Of the mesh, which follows the parameters above and is no parameter of the field.
+MESH_ARRAYS = {"silhouette_sampling_weight", "faces", "vertex_positions", "vertex_normals", "vertex_texcoords"}
+
+
+def posed(scene):
+    """The scene with its head moved a little: differences are taken in proportion to a parameter."""
+    params = mi.traverse(scene)
+    params["head.pose"] = mi.Float([0.2, -0.3, 0.1, 0.2, 0.1, -0.3])
+    params.update()
+    return scene
+
+
+@pytest.fixture(scope="module")
+def movable(avatar, avatar_path):
+    """A movable head with stock albedos: no network of the albedo has gradients beside the parameter under test."""
+    head = scenes.head(avatar_path, voxel=0.2, movable=True)
+    head["bsdf"]["diffuse_albedo"] = {"type": "rgb", "value": [0.6, 0.4, 0.3]}
+    head["bsdf"]["specular_albedo"] = 0.04
+    return posed(build(avatar_path, avatar, {"type": "sira_sg"}, head=head))
+
+
+def test_the_parameters_tested_are_all_that_head_and_light_expose(movable):
+    exposed = {key for key in mi.traverse(movable).keys() if key.startswith(("light.", "head."))}  # noqa: SIM118
+    arrays = {key for key in exposed if key.split(".")[-1] in MESH_ARRAYS}
+    assert exposed - arrays == set(PLAIN_PARAMETERS)
+
+
+@pytest.mark.parametrize("key", PLAIN_PARAMETERS)
+def test_derivatives_of_the_closed_form_by_each_parameter_alone(movable, key):
+    weight = weights(19) * interior(mi.render(movable).numpy()[:, :, 18])[:, :, None]
+    weight[:, :, 3:] = 0
+    shape = key in ("head.z_sdf", "head.deformation", "head.reference", "head.pose")
+    check(movable, key, weight, change=3e-4 if shape else 2e-3, tolerance=3e-3 if shape else 1e-3)
+
+
+def test_radiance_is_differentiable_by_the_pose_alone(avatar, avatar_path):
+    head = scenes.head(avatar_path, voxel=0.2, movable=True)
+    head["bsdf"] = {"type": "diffuse"}
+    scene = posed(build(avatar_path, avatar, {"type": "sira_radiance", "avatar": avatar_path}, light=False, head=head))
+    weight = weights(6) * interior(mi.render(scene).numpy()[:, :, 3])[:, :, None]
+    weight[:, :, 3:] = 0
+    check(scene, "head.pose", weight, change=3e-4, tolerance=3e-3)

@@ -7,17 +7,17 @@ import pytest
 from conftest import camera
 
 from sira_mi.export import scene as scenes
-from sira_mi.sg.multisampling import REACH, leaders
+from sira_mi.sg.multisampling import REACH, representative_samples
 
 UP = np.array([[0.0], [0.0], [1.0]])
 SIZE = 96
 ALBEDO, MASK = slice(10, 13), 18
 
 
-def test_the_middle_sample_leads_its_pixel():
-    """Two pixels of three samples on a line: the one in the middle leads its own pixel only."""
+def test_the_middle_sample_represents_its_pixel():
+    """Two pixels of three samples on a line: the one in the middle represents its own pixel only."""
     position = np.stack([[0.0, 0.01, 0.02, 0.5, 0.49, 0.51], np.zeros(6), np.zeros(6)])
-    assert leaders(position, UP.repeat(6, axis=1), np.ones(6, bool), 3).tolist() == [1, 1, 1, 3, 3, 3]
+    assert representative_samples(position, UP.repeat(6, axis=1), np.ones(6, bool), 3).tolist() == [1, 1, 1, 3, 3, 3]
 
 
 @pytest.mark.parametrize("what", ["distance", "normal", "coverage"])
@@ -30,18 +30,20 @@ def test_nothing_is_shared_across_an_edge(what):
         normal[:, 3] = [np.sin(0.4), 0, np.cos(0.4)]
     else:
         hit[3] = False
-    assert leaders(position, normal, hit, 4).tolist() == [0, 1, 2, 3]
+    assert representative_samples(position, normal, hit, 4).tolist() == [0, 1, 2, 3]
 
 
-def test_leaders_lead_themselves_within_their_pixel():
-    """Of random hits: whoever leads is hit, leads itself, and is of the same pixel."""
+def test_representatives_represent_themselves_within_their_pixel():
+    """Of random hits: a representative is hit, represents itself, and is of the same pixel."""
     rng = np.random.default_rng(0)
     position = np.repeat(rng.standard_normal((3, 200)), 5, axis=1) + 0.015 * rng.standard_normal((3, 1000))
     hit = rng.random(1000) < 0.95
-    leader = leaders(position, UP.repeat(1000, axis=1), hit, 5)
-    assert (leader[leader] == leader).all() and (leader // 5 == np.arange(1000) // 5).all()
-    assert hit[leader[hit]].all()
-    alone = leader == np.arange(1000)
+    representative = representative_samples(position, UP.repeat(1000, axis=1), hit, 5)
+    assert (representative[representative] == representative).all() and (
+        representative // 5 == np.arange(1000) // 5
+    ).all()
+    assert hit[representative[hit]].all()
+    alone = representative == np.arange(1000)
     assert 100 < alone.sum() < 900
 
 

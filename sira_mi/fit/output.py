@@ -18,7 +18,8 @@ from sira_mi.fields.sdf import surface
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
-from sira_mi.relight.pictures import LAYERS, preview
+from sira_mi.relight.pictures import preview
+from sira_mi.sg.layers import split_layers
 
 # Samples a pixel of the closed-form renders.
 _SAMPLES = 4
@@ -38,11 +39,7 @@ SECOND_LIGHT = np.array(
 
 def render_layers(scene: mi.Scene) -> dict[str, np.ndarray]:
     """All layers of an `avatar_scene`: [H, W, 3], one-channel ones [H, W]."""
-    image = mi.render(scene, spp=_SAMPLES, seed=0).numpy()
-    return {
-        name: image[..., start] if count == 1 else image[..., start : start + count]
-        for name, (start, count) in LAYERS.items()
-    }
+    return split_layers(mi.render(scene, spp=_SAMPLES, seed=0).numpy())
 
 
 def render_radiance(scene: mi.Scene) -> np.ndarray:
@@ -59,7 +56,7 @@ def avatar_scene(
     in_photo: bool = False,
 ) -> mi.Scene:
     """The head of an avatar file before a black background, closed-form shading, `lobes` [N_l, 7] as its light; evenly
-    spread samples in each pixel, against jagged outlines. `extra_channels` are those of `LAYERS` but the radiance.
+    spread samples in each pixel, against jagged outlines. `extra_channels` are those of `sira_sg`.
     `in_photo`: the lobes are the avatar's own, and its refinement of that light is in the radiance."""
     refinement = {"light_refinement": avatar_path} if in_photo else {}
     return mi.load_dict(

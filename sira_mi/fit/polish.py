@@ -27,7 +27,8 @@ from sira_mi.fit.output import head_box
 from sira_mi.fit.settings import FitSettings, Stage
 from sira_mi.fit.shaded import decode_lobes, decoder
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.relight.pictures import LAYERS, psnr_inside
+from sira_mi.relight.pictures import psnr_inside
+from sira_mi.sg.layers import split_layers
 
 # Where the scene keeps what the picture is made of.
 _SEEN = {
@@ -183,9 +184,9 @@ def picture_detail(scene: mi.Scene, avatar_path: str | Path) -> np.ndarray:
     closed_form = {"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)}
     exact = mi.render(scene, integrator=mi.load_dict(closed_form), spp=16, seed=0).numpy()
     baked = mi.render(scene, integrator=mi.load_dict({"type": "aov", "aovs": "albedo:albedo"}), spp=16, seed=0).numpy()
-    channels = {name: exact[..., start : start + count] for name, (start, count) in LAYERS.items()}
-    albedo = np.clip((channels["diffuse_albedo"] + _DARK) / (baked[..., :3] + _DARK), 0.5, 2.0)
-    light = (channels["final"] + _DARK) / (channels["diffuse"] + channels["specular"] + _DARK)
+    layers = split_layers(exact)
+    albedo = np.clip((layers["diffuse_albedo"] + _DARK) / (baked[..., :3] + _DARK), 0.5, 2.0)
+    light = (layers["final"] + _DARK) / (layers["diffuse"] + layers["specular"] + _DARK)
     return (albedo * light).astype(np.float32)
 
 

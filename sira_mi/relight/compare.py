@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.portrait.camera import Camera
-from sira_mi.relight.pictures import LAYERS, psnr_inside
+from sira_mi.relight.pictures import psnr_inside
 from sira_mi.relight.render import RelightSettings, load_scene, render_passes
 from sira_mi.relight.subject import Light
+from sira_mi.sg.layers import split_layers
 
 # Samples a pixel of the closed form, which only its outlines need.
 CLOSED_FORM_SAMPLES = 8
@@ -53,7 +54,7 @@ def compare(
         images.append(render_passes(scene, one, done))
         seconds.append(time.monotonic() - start)
     closed_form, traced = (image[..., :3] for image in images)
-    mask = images[0][..., LAYERS["mask"][0]] > 0.99
+    mask = split_layers(images[0])["mask"] > 0.99
     difference, mean = (closed_form - traced)[mask], mean_radiance(traced, mask)
     return Comparison(
         closed_form=closed_form,

@@ -1,4 +1,4 @@
-"""Pictures of a head: the layers of the `sira_sg` film, previews of them, and how near two pictures are."""
+"""Pictures of a head: previews of the layers of `sira_sg`, and how near two pictures are."""
 
 import numpy as np
 
@@ -7,19 +7,6 @@ from sira_mi.portrait.load import linear_to_srgb
 # The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
 _BRIGHTEST_SPECULAR = 0.08
 _PEAK_NOISE = 1e-12  # least mean squared error that counts
-
-
-# Channels of the `sira_sg` film: first channel and number of channels of every layer.
-LAYERS = {
-    "final": (0, 3),
-    "diffuse": (4, 3),
-    "specular": (7, 3),
-    "diffuse_albedo": (10, 3),
-    "specular_albedo": (13, 1),
-    "normal": (14, 3),
-    "depth": (17, 1),
-    "mask": (18, 1),
-}
 
 
 def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Samples of one pixel that see almost the same place share a shading: coverage by the sample, shading by the pixel."""
+"""Samples of a pixel that see almost the same place share a shading: coverage by sample, shading by pixel."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ REACH = 0.04
 COSINE = 0.966
 
 
-def leaders(position: np.ndarray, normal: np.ndarray, hit: np.ndarray, samples: int) -> np.ndarray:
-    """The number [N] of the sample whose shading each sample takes: its own, or that of the middle one of its pixel.
-    Samples of a pixel are `samples` consecutive columns of hits [3, N] with unit normals [3, N]; `hit` [N] is bool."""
+def representative_samples(position: np.ndarray, normal: np.ndarray, hit: np.ndarray, samples: int) -> np.ndarray:
+    """Index [N] of the sample whose shading each sample takes: its own, or the middle sample of its pixel. `samples`
+    consecutive columns of positions and unit normals [3, N] are a pixel; `hit` [N] is bool."""
     own = np.arange(hit.size)
     shape = hit.size // samples, samples
     p, n = position.reshape(3, *shape), normal.reshape(3, *shape)
