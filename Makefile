@@ -1,4 +1,4 @@
-# Two commands: `make fit` turns a photo into an avatar, `make test` runs all tests.
+# make fit: photo to avatar.  make check: a minute of checks.  make test: all of them.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,11 +6,11 @@ OUT ?= avatar
 QUALITY ?= standard
 PHOTO ?=
 
-.PHONY: install fit test lint
+.PHONY: install fit lint check test
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml
+$(VENV)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
@@ -22,6 +22,11 @@ fit: install
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/vulture
 
-test: install lint
+check: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+test: lint
 	$(BIN)/python -m pytest

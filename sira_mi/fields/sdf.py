@@ -79,7 +79,7 @@ def deform_cooperative(packed, octaves: int, x: list) -> tuple[list, list]:
 
 
 def signed_distance(field: SdfField, x):
-    """Eq. 3: x [3, N] -> signed distance [1, N], negative inside."""
+    """Eqs 2b and 3: x [3, N] -> signed distance [1, N], negative inside."""
     x_ref, _ = deform(field, x)
     return evaluate(field.reference, encode(x_ref, field.octaves))
 
