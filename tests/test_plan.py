@@ -16,6 +16,7 @@ from sira_mi.avatar.file import PRIOR, load_avatar, save_avatar
 from sira_mi.decisions import Decision, Plan, explain
 from sira_mi.errors import InputError
 from sira_mi.export.scene import orbit
+from sira_mi.fields.directions import fibonacci_directions
 from sira_mi.fit.driver import Progress, run_stages
 from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
 from sira_mi.fit.leave_out import plan_fit
@@ -30,7 +31,6 @@ from sira_mi.relight.subject import Light, Subject
 from sira_mi.relight.surface import Surface, bounced_radiance, sample_surface
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
-from sira_mi.sg.lobes import fibonacci_directions
 from sira_mi.sg.shading import shade_tensor
 from sira_mi.sg.weak_lobes import radiance_bounds, select_lobes, white_radiance
 from studies.leave_out.page import commands, plan_table

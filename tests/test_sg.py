@@ -11,6 +11,7 @@ from scipy.special import i0e
 
 mi.set_variant("llvm_ad_rgb")
 
+from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
 from sira_mi.sg import brdf, integrals, lobes, shading  # noqa: E402
 from sira_mi.sg import fit_environment as fit  # noqa: E402
 
@@ -176,7 +177,7 @@ def reflecting_view(degrees, roughness, count=50):
     spread = roughness**2 / np.sqrt(2) * np.random.default_rng(8).standard_normal((count, 2))
     half = np.concatenate([spread, np.ones((count, 1))], axis=1)
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    return view, np.concatenate([lobes.fibonacci_directions(count), 2 * (half @ view)[:, None] * half - view])
+    return view, np.concatenate([fibonacci_directions(count), 2 * (half @ view)[:, None] * half - view])
 
 
 def specular_form(function, view, roughness, albedo, sharpness, axes):
@@ -376,7 +377,7 @@ def test_initial_lobes_have_the_energy_asked_for():
 
 def test_lobes_pack_and_evaluate_alike_in_numpy_and_drjit():
     values = lobes.initial_lobes(5)
-    directions = lobes.fibonacci_directions(50)
+    directions = fibonacci_directions(50)
     packed = lobes.pack_lobes(*lobes.unpack_lobe(mi.TensorXf(values).array, dr.arange(mi.UInt32, 5)))
     np.testing.assert_allclose(packed.numpy(), values, rtol=1e-6, atol=1e-7)
     total = sum(
@@ -410,7 +411,7 @@ def test_environment_fit_keeps_the_light_and_the_sun():
     row, column = np.unravel_index(np.argmax(image.sum(axis=2)), image.shape[:2])
     np.testing.assert_allclose(energy, image[row, column] * solid_angle[row], rtol=0.02)
     # What lies under a cosine, the irradiance, is what shading sees.
-    normals = lobes.fibonacci_directions(40)
+    normals = fibonacci_directions(40)
     cosine = np.maximum(directions.reshape(-1, 3) @ normals.T, 0) * np.repeat(solid_angle, image.shape[1])[:, None]
     rendered = fit.render_environment(fitted, image.shape[0])
     np.testing.assert_allclose(cosine.T @ rendered.reshape(-1, 3), cosine.T @ image.reshape(-1, 3), rtol=0.03)

@@ -13,10 +13,11 @@ mi.set_variant("llvm_ad_rgb")
 from mitsuba.chi2 import ChiSquareTest, SphericalDomain  # noqa: E402
 
 from sira_mi.errors import InputError  # noqa: E402
+from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
 from sira_mi.files import write_exr  # noqa: E402
 from sira_mi.sg import lights_io  # noqa: E402
 from sira_mi.sg.fit_environment import render_environment, total_light  # noqa: E402
-from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions  # noqa: E402
+from sira_mi.sg.lobes import evaluate_lobes  # noqa: E402
 
 LOBES = np.array(
     [[0.0, 1.0, 0.0, 1.5, 0.5, 0.6, 0.8], [0.6, 0.5, 0.6, 60.0, 5.0, 4.0, 3.0], [-1.0, 0.1, 0.8, 8.0, 0.3, 0.5, 0.9]],

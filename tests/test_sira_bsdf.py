@@ -11,7 +11,8 @@ mi.set_variant("llvm_ad_rgb")
 
 from mitsuba.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain  # noqa: E402
 
-from sira_mi.sg import lobes, shading  # noqa: E402
+from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
+from sira_mi.sg import shading  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -146,7 +147,7 @@ def test_white_furnace_is_the_models_own():
 def test_closed_form_agrees_with_monte_carlo():
     """`shade` against this plugin under `sg_envmap` with the same lobes, by view angle; the errors are printed."""
     generator = np.random.default_rng(4)
-    lights = np.concatenate([lobes.fibonacci_directions(48), generator.uniform(3, 50, (48, 1))], axis=1)
+    lights = np.concatenate([fibonacci_directions(48), generator.uniform(3, 50, (48, 1))], axis=1)
     lights = mi.TensorXf(np.concatenate([lights, generator.uniform(0.2, 2, (48, 3))], axis=1).astype(np.float32))
     light = mi.load_dict({"type": "sg_envmap", "lobes": lights})
     specular_albedo, count, ctx = 0.375, 1 << 19, mi.BSDFContext()

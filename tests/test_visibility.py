@@ -12,7 +12,8 @@ from conftest import camera
 from sira_mi.export import scene as scenes
 from sira_mi.errors import InputError
 from sira_mi.sg import visibility
-from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions
+from sira_mi.fields.directions import fibonacci_directions
+from sira_mi.sg.lobes import evaluate_lobes
 
 # Soft, and with a small bright one.
 SOFT = np.array([[-0.5, 0.4, 0.76, 6, 2.0, 1.8, 1.5], [0.6, 0.6, 0.3, 20, 1, 2, 3], [0, 1, 0, 0.5, 0.3, 0.35, 0.4]])

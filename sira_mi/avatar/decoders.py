@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import in_three
+from sira_mi.fields.directions import fibonacci_directions
 from sira_mi.fields.encoding import encode, encode_cooperative
 from sira_mi.fields.mlp import evaluate, evaluate_cooperative
-from sira_mi.sg.lobes import fibonacci_directions
 
 # Bounds of the illumination decoder: log-sharpness and log-amplitude of a lobe, and its initial sharpness.
 LOG_SHARPNESS = (-1.0, 5.5)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.sg.lobes import evaluate_lobes, fibonacci_directions
+from sira_mi.fields.directions import fibonacci_directions
+from sira_mi.sg.lobes import evaluate_lobes
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# The golden angle: consecutive directions of a Fibonacci lattice on the sphere differ by it in azimuth.
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+from sira_mi.fields.directions import fibonacci_directions
 
 
 def lobe_count(lobes: "mi.TensorXf") -> int:
@@ -53,15 +52,6 @@ def evaluate_lobes(lobes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     axis = lobes[:, :3] / np.linalg.norm(lobes[:, :3], axis=1, keepdims=True)
     cosine = np.clip(directions @ axis.T, -1.0, 1.0)
     return np.exp(lobes[:, 3] * (cosine - 1.0)) @ lobes[:, 4:]
-
-
-def fibonacci_directions(count: int) -> np.ndarray:
-    """`count` near-uniform unit directions `[count, 3]` (float64), from +y down to −y."""
-    index = np.arange(count)
-    y = 1.0 - (2.0 * index + 1.0) / count
-    radius = np.sqrt(1.0 - y * y)
-    azimuth = GOLDEN_ANGLE * index
-    return np.stack([radius * np.cos(azimuth), y, radius * np.sin(azimuth)], axis=1)
 
 
 def initial_lobes(count: int, energy: float = 2.0 * np.pi, seed: int = 0) -> np.ndarray:

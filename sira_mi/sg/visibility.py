@@ -23,9 +23,10 @@ import numpy as np
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.columns import in_three, to_columns
+from sira_mi.fields.directions import GOLDEN_ANGLE, fibonacci_directions
 from sira_mi.sg import brdf
 from sira_mi.sg.integrals import sphere_integral
-from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions, lobe_count, unpack_lobe
+from sira_mi.sg.lobes import lobe_count, unpack_lobe
 
 # The sharpest lobe that K even directions over the sphere resolve, as a share of K.
 _RESOLVED = 0.25

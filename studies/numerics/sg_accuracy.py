@@ -102,7 +102,7 @@ def quadrature(view: np.ndarray, roughness: float, sharpness: float, axes: np.nd
 
 def light_directions(view: np.ndarray, roughness: float) -> np.ndarray:
     """Axes [D, 3]: a Fibonacci lattice, and `view` reflected about a spiral of half vectors that follow D."""
-    from sira_mi.sg.lobes import GOLDEN_ANGLE, fibonacci_directions
+    from sira_mi.fields.directions import GOLDEN_ANGLE, fibonacci_directions
 
     count = DIRECTIONS // 2
     distribution = 2.0 / roughness**4
