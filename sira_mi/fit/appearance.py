@@ -127,8 +127,7 @@ class AppearanceProblem:
             radiance = radiance * dr.exp(of_light)
         terms = {
             "color": losses.photometric_loss(radiance, target),
-            "embedding": weights.embedding
-            * (_square(current["z_a"]) + _square(current["z_s"]) + _square(current["z_l"])),
+            "embedding": weights.embedding * losses.squared_norm(*(current[name] for name in ("z_a", "z_s", "z_l"))),
             "white_light": weights.white_light * _chroma(shading.lobes),
         }
         if skin_tone is not None:
@@ -169,10 +168,6 @@ def exposed(avatar: Avatar, illumination_parameters: np.ndarray, factor: float) 
 def _norm_1(v):
     """‖v‖₁ of the columns of v [rows, N]: [N]."""
     return dr.sum(dr.abs(v), axis=0)
-
-
-def _square(latent):
-    return dr.sum(latent * latent, axis=None)
 
 
 def _chroma(lobes):

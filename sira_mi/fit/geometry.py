@@ -118,7 +118,7 @@ class GeometryProblem:
             "color": weights.color * stage.color * color,
             "mask": weights.mask * mask,
             "eikonal": weights.eikonal * losses.eikonal_loss(gradient),
-            "embedding": weights.embedding * sum(_square(current[name]) for name in (*SHAPE_LATENTS, "z_r")),
+            "embedding": weights.embedding * losses.squared_norm(*(current[name] for name in (*SHAPE_LATENTS, "z_r"))),
         }
         if self.landmarks is not None:
             terms["landmark"] = weights.landmark * stage.landmark * self._landmark_loss(field)
@@ -195,10 +195,6 @@ def _inverse(motion):
     """[3, 4] matrix (Rᵀ | −Rᵀ t) of a rigid motion (R | t)."""
     turned = dr.concat([dr.reshape(motion[:, k : k + 1], (1, 3)) for k in range(3)], axis=0)
     return dr.concat([turned, -(turned @ motion[:, 3:4])], axis=1)
-
-
-def _square(latent):
-    return dr.sum(latent * latent, axis=None)
 
 
 def moved_camera(camera: Camera, pose: np.ndarray) -> Camera:

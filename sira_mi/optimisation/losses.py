@@ -1,5 +1,8 @@
 """Losses of the statistical models and of the fit, on tensors `[rows, N]`, one column a point."""
 
+from functools import reduce
+from operator import add
+
 import drjit as dr
 
 
@@ -51,9 +54,14 @@ def landmark_loss(x_ref, scenes: int):
     return 2.0 * mean(dr.sum(square - centre * centre, axis=0))
 
 
-def embedding_loss(latent):
-    """L_Emb: mean over scenes of ‖z‖² for latents [dim, S]."""
-    return mean(dr.sum(latent * latent, axis=0))
+def embedding_loss(*latents):
+    """L_Emb of eqs 7 and 10: mean over scenes of the sum of ‖z‖² over `latents` [dim, S]."""
+    return reduce(add, (mean(dr.sum(z * z, axis=0)) for z in latents))
+
+
+def squared_norm(*latents):
+    """The sum of ‖z‖² over `latents` [dim] of one head."""
+    return reduce(add, (dr.sum(z * z, axis=None) for z in latents))
 
 
 def display(radiance):

@@ -189,7 +189,7 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     grey = amplitude - in_three(dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count)), axis=1)
     return {
         "color": losses.photometric_loss(diffuse_part + specular_part, batch.colors),
-        "embedding": losses.embedding_loss(z_a) + losses.embedding_loss(z_s) + losses.embedding_loss(z_l),
+        "embedding": losses.embedding_loss(z_a, z_s, z_l),
         "smoothness": losses.mean(dr.abs(difference)),
         "specular_anchor": losses.mean(anchor * anchor),
         "white_light": losses.mean(grey * grey),

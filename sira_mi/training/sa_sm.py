@@ -156,7 +156,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
         "deformation": losses.deformation_loss(x_ref - points, batch.count),
         "landmark": losses.landmark_loss(deform(field, batch.landmarks)[0], batch.count),
         "color": losses.photometric_loss(radiance, batch.colors),
-        "embedding": sum(losses.embedding_loss(z) for z in latents.values()),
+        "embedding": losses.embedding_loss(*latents.values()),
     }
 
 
