@@ -1,5 +1,7 @@
-"""Every row of `docs/stability.md`, with fewer cases: errors in single precision within bounds, everything finite.
-And that a row can fail, and what the page says of it."""
+"""Every row of `docs/stability.md` but those of fits, with fewer cases: errors in single precision within bounds,
+everything finite. A row can fail, the page says so, and it is made of its data alone."""
+
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -12,11 +14,13 @@ from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, surface
 from studies.stability.fields64 import Field64
-from studies.stability.page import Measured, load_rows, page, write_page
-from studies.stability.rows import Row, Section, largest, relative_error
-from studies.stability.sections import SECTIONS
+from studies.stability.fit_runs import list_code
+from studies.stability.page import Measured, fill_template, load_rows, write_page
+from studies.stability.rows import Row, largest, relative_error
+from studies.stability.sections import NUMERICS, list_sections
 
-MEASURES = [measure for section in SECTIONS.values() for measure in section.measures]
+DOCS = Path(__file__).parents[1] / "docs"
+MEASURES = [measure for measures in NUMERICS.values() for measure in measures]
 
 
 @pytest.mark.parametrize("measure", MEASURES, ids=[f"{m.__module__.split('.')[-1]}-{m.__name__}" for m in MEASURES])
@@ -34,27 +38,43 @@ def test_measures_notice_what_is_wrong():
     assert largest(np.array([1.0, np.nan])) == np.inf
     assert relative_error(np.array([1.0, 5.0]), np.array([1.0, 1e-9]), 1.0) == 0.0
     assert relative_error(np.array([1.1]), np.array([1.0]), 1.0) == pytest.approx(0.1)
-    good = {"name": "a", "meaning": "b", "cases": 1, "error": 0.5, "bound": 1.0, "non_finite": 0}
+    good = {"name": "a", "unit": "b", "cases": 1, "error": 0.5, "bound": 1.0, "non_finite": 0}
     assert Row(**good).passed and Row(**good, gradients_finite=True).passed
     for fault in ({"error": 2.0}, {"error": np.nan}, {"non_finite": 1}, {"gradients_finite": False}):
         row = Row(**{**good, **fault})
         assert not row.passed
-        assert "**missed**" in page({"a": Section("t", "i", ())}, {"a": Measured(True, (row,))})
+        page = fill_template({"sampling": Measured(True, (row,))})
+        assert "missed**" in page and "| rows that miss theirs | a (b) |" in page
 
 
 def test_a_section_that_is_not_measured_stays_on_the_page(tmp_path):
     """Rows are read back as they were, infinite errors too; a damaged file is refused in one line."""
-    sections = {name: Section(f"Part {name}", "i", ()) for name in "ab"}
     row = Row("r", "m", 1, float("inf"), 1.0, 0, True)
-    write_page(tmp_path, sections, {"a": Measured(False, (row,))})
+    write_page(tmp_path, {"sampling": Measured(False, (row,))})
     measured = load_rows(tmp_path)
-    assert measured == {"a": Measured(False, (row,))}
-    path = write_page(tmp_path, sections, {**measured, "b": Measured(True, ())})
+    assert measured == {"sampling": Measured(False, (row,))}
+    path = write_page(tmp_path, {**measured, "tracing": Measured(True, (Row("s", "mm", 1, 0.5, 1.0, 0),))})
     text = path.read_text(encoding="utf-8")
-    assert "## Part a" in text and "## Part b" in text and "Missed: r." in text
-    (tmp_path / "stability.json").write_text("[1]")
+    assert "| **inf (1), missed** | m |" in text and "| s | 0.5 (1) | mm |" in text and "Not measured yet." in text
+    (tmp_path / "data" / "stability.json").write_text("[1]")
     with pytest.raises(InputError, match="damaged"):
         load_rows(tmp_path)
+
+
+def test_the_page_is_its_data_filled_in(tmp_path):
+    """The committed page is what its figures give, has all sections, and can be read in a few minutes."""
+    text = write_page(tmp_path, load_rows(DOCS)).read_text(encoding="utf-8")
+    assert text == (DOCS / "stability.md").read_text(encoding="utf-8")
+    assert (tmp_path / "data" / "stability.json").read_bytes() == (DOCS / "data" / "stability.json").read_bytes()
+    assert len(text.split()) < 1200 and "Not measured yet." not in text
+    rows = {name: len(part.rows) for name, part in load_rows(DOCS).items()}
+    assert rows == {name: len(measures) for name, measures in list_sections(tmp_path).items()}
+
+
+def test_a_fit_of_corrupt_input_is_repeated_when_the_code_of_fits_changes():
+    """What is read to tell so includes the fit, the plugins and how results are scored."""
+    names = {f"{path.parent.name}/{path.name}" for path in list_code()}
+    assert {"fit/driver.py", "plugins/neural_sdf.py", "avatar/file.py", "stability/fit_cases.py"} <= names
 
 
 def test_the_reference_field_is_the_package_s():

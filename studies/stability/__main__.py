@@ -1,8 +1,8 @@
-"""`python -m studies.stability [--only SECTION …]`: measures every row and writes the page of numerical stability.
+"""`python -m studies.stability [--only SECTION …]`: measures numerical stability, writes the figures and their page.
 
-The fits take half an hour; those that are finished are kept in `--work` and done again only when something that they
-depend on has changed. Sections that are not measured stay on the page as they were. Ends with 1 when a row misses its
-bound."""
+The figures go to `docs/data/stability.json`, the page that is filled with them to `docs/stability.md`. The fits take
+half an hour; finished ones are kept in `--work` and run again only when something that they depend on has changed.
+Sections that are not measured keep their figures. Ends with 1 when a row misses its bound."""
 
 import time
 from pathlib import Path
@@ -26,16 +26,16 @@ def main() -> int:
     mi.set_variant(arguments.variant)
 
     from studies.stability.page import Measured, load_rows, write_page
-    from studies.stability.sections import all_sections
+    from studies.stability.sections import list_sections
 
-    sections = all_sections(arguments.work)
+    sections = list_sections(arguments.work)
     if unknown := set(arguments.only or ()) - set(sections):
         raise InputError(f"unknown sections {', '.join(sorted(unknown))}; known are {', '.join(sections)}")
     measured = {name: part for name, part in load_rows(arguments.out).items() if name in sections}
     start, passed = time.monotonic(), True
     for name in arguments.only or sections:
         rows = []
-        for measure in sections[name].measures:
+        for measure in sections[name]:
             began = time.monotonic()
             row = measure(arguments.quick)
             verdict = "met" if row.passed else "MISSED"
@@ -47,8 +47,8 @@ def main() -> int:
             rows.append(row)
             passed &= row.passed
         measured[name] = Measured(arguments.quick, tuple(rows))
-        path = write_page(arguments.out, sections, measured)
-    print(f"{path} written after {time.monotonic() - start:.0f} s")
+        path = write_page(arguments.out, measured)
+    print(f"wrote {path} after {time.monotonic() - start:.0f} s")
     return int(not passed)
 
 

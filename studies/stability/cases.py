@@ -12,33 +12,33 @@ ROUGHNESS = (0.02, 1.0)
 _WIDTHS = 6.5
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def normalise(vectors: np.ndarray) -> np.ndarray:
     """Columns scaled to unit length."""
     return vectors / np.linalg.norm(vectors, axis=0)
 
 
-def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+def draw_directions(rng: np.random.Generator, count: int) -> np.ndarray:
     """Uniform on the sphere."""
-    return single(unit(rng.standard_normal((3, count))))
+    return single(normalise(rng.standard_normal((3, count))))
 
 
-def across(rng: np.random.Generator, axis: np.ndarray) -> np.ndarray:
+def draw_perpendicular(rng: np.random.Generator, axis: np.ndarray) -> np.ndarray:
     """Unit vectors at right angles to `axis`."""
-    return unit(np.cross(axis.T, rng.standard_normal(axis.T.shape)).T)
+    return normalise(np.cross(axis.T, rng.standard_normal(axis.T.shape)).T)
 
 
-def tilted(rng: np.random.Generator, axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def tilt(rng: np.random.Generator, axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Unit vectors at `angle` (radians) to `axis`, in random azimuths."""
-    return single(np.cos(angle) * unit(axis) + np.sin(angle) * across(rng, axis))
+    return single(np.cos(angle) * normalise(axis) + np.sin(angle) * draw_perpendicular(rng, axis))
 
 
-def around(rng: np.random.Generator, axis: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
+def draw_near(rng: np.random.Generator, axis: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
     """Directions in the reach of lobes."""
     angle = rng.uniform(0.0, _WIDTHS, axis.shape[1]) / np.sqrt(np.maximum(sharpness, 1.0))
-    return tilted(rng, axis, np.minimum(angle, np.pi * rng.random(axis.shape[1]) ** 0.5))
+    return tilt(rng, axis, np.minimum(angle, np.pi * rng.random(axis.shape[1]) ** 0.5))
 
 
-def sharpnesses(rng: np.random.Generator, count: int, highest: float = SHARPNESS[1]) -> np.ndarray:
+def draw_sharpnesses(rng: np.random.Generator, count: int, highest: float = SHARPNESS[1]) -> np.ndarray:
     """Even in the logarithm from 1e-6 to `highest`; a tenth each is 0, the lowest and the highest."""
     values = np.exp(rng.uniform(np.log(SHARPNESS[0]), np.log(highest), count))
     kind = rng.integers(0, 10, count)
@@ -47,7 +47,7 @@ def sharpnesses(rng: np.random.Generator, count: int, highest: float = SHARPNESS
     return single(values)
 
 
-def amplitudes(rng: np.random.Generator, count: int) -> np.ndarray:
+def draw_amplitudes(rng: np.random.Generator, count: int) -> np.ndarray:
     """RGB `[3, count]`: even in the logarithm from 1e-3 to 1e6; a tenth each is 0 and 1e6."""
     values = 10.0 ** rng.uniform(-3.0, 6.0, (3, count))
     kind = rng.integers(0, 10, count)
@@ -56,37 +56,38 @@ def amplitudes(rng: np.random.Generator, count: int) -> np.ndarray:
     return single(values)
 
 
-def second_axes(rng: np.random.Generator, axis: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
+def draw_second_axes(rng: np.random.Generator, axis: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
     """Axes of second lobes: parallel, opposite, orthogonal, nearly opposite (a tenth each), random (two tenths), and
     within the reach of lobes of `sharpness`."""
     count = axis.shape[1]
     kind = rng.integers(0, 10, count)
-    result = around(rng, axis, sharpness)
-    orthogonal, anywhere = single(across(rng, axis)), directions(rng, count)
-    opposite = tilted(rng, -axis, np.exp(rng.uniform(np.log(1e-6), np.log(1e-1), count)))
+    result = draw_near(rng, axis, sharpness)
+    orthogonal, anywhere = single(draw_perpendicular(rng, axis)), draw_directions(rng, count)
+    opposite = tilt(rng, -axis, np.exp(rng.uniform(np.log(1e-6), np.log(1e-1), count)))
     for index, value in enumerate((axis, -axis, orthogonal, opposite, anywhere, anywhere)):
         result[:, kind == index] = value[:, kind == index]
     return result
 
 
-def roughnesses(rng: np.random.Generator, count: int) -> np.ndarray:
+def draw_roughnesses(rng: np.random.Generator, count: int) -> np.ndarray:
     """Even in the logarithm from 0.02 to 1, both ends included."""
-    values = np.exp(rng.uniform(*np.log(ROUGHNESS), count))
+    values = np.exp(rng.uniform(np.log(ROUGHNESS[0]), np.log(ROUGHNESS[1]), count))
     values[: count // 10] = ROUGHNESS[0]
     values[count // 10 : count // 5] = ROUGHNESS[1]
     return single(rng.permutation(values))
 
 
-def views(rng: np.random.Generator, normal: np.ndarray, lowest: float = 1e-6) -> np.ndarray:
+def draw_views(rng: np.random.Generator, normal: np.ndarray, lowest: float = 1e-6) -> np.ndarray:
     """Directions above the surface; half of them even in the logarithm of n·v from `lowest` to 1."""
     count = normal.shape[1]
     cosine = np.where(rng.random(count) < 0.5, np.exp(rng.uniform(np.log(lowest), 0.0, count)), rng.random(count))
-    return single(cosine * unit(normal) + np.sqrt(1.0 - cosine**2) * across(rng, normal))
+    return single(cosine * normalise(normal) + np.sqrt(1.0 - cosine**2) * draw_perpendicular(rng, normal))
 
 
-def lobe_sets(rng: np.random.Generator, count: int) -> np.ndarray:
+def draw_lobes(rng: np.random.Generator, count: int) -> np.ndarray:
     """Lobes `[count, 7]`; the first has the amplitude 1e6, the second, if there is one, 0."""
-    lobes = np.concatenate([directions(rng, count), sharpnesses(rng, count)[None], amplitudes(rng, count)]).T
+    axes, sharpness, amplitudes = (draw(rng, count) for draw in (draw_directions, draw_sharpnesses, draw_amplitudes))
+    lobes = np.concatenate([axes, sharpness[None], amplitudes]).T
     lobes[0, 4:] = 1e6
     lobes[1:2, 4:] = 0.0
     return lobes

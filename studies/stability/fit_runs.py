@@ -1,26 +1,30 @@
-"""One fit of a spoilt portrait, in a process of its own, and how far its avatar is from the truth."""
+"""One fit of corrupt input, in a process of its own, and the error of its avatar against the truth."""
 
+import importlib
 import json
 import multiprocessing
 import os
 import tempfile
 import time
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.file import PRIOR
 from sira_mi.errors import InputError
-from sira_mi.files import write_png, write_through
-from studies.cache import fingerprint, load_or_compute
-from studies.stability.fit_cases import CASES, Case, Fed
-from studies.stability.rows import non_finite
+from sira_mi.files import write_png
+from studies.cache import fingerprint, load_or_compute, write_json
+from studies.stability.fit_cases import CASES, Case, CorruptInput
+from studies.stability.rows import count_non_finite
 
-# A fit is repeated when any module of these packages has changed, or how it is fed and scored.
-_DEPENDS_ON = ("fields", "fit", "models", "plan", "plugins", "portrait", "sg")
+if TYPE_CHECKING:
+    from studies.portraits.truth import Truth
+
+# A fit is repeated when a module of these packages has changed, its input, or how it is scored.
+_DEPENDS_ON = ("avatar", "export", "fields", "fit", "optimisation", "plugins", "portrait", "relight", "sg")
 _GEOMETRY_SAMPLES = 4000
 
 
@@ -37,32 +41,33 @@ class Fit:
     variant: str
     seed: int = 0
 
-    @property
-    def the_case(self) -> Case:
+    def find_case(self) -> Case:
         return next(case for case in CASES if case.name == self.case)
 
 
-def fitted(fit: Fit, work: Path) -> dict:
-    """What came of a fit, run now unless `work` holds it: `refused`, the message of its InputError; or `crashed`, the
-    exit code; or `notes`, `face_mm`, `psnr_db`, `non_finite`, `closed` and `core_seconds`. A picture and what the fit
-    printed stay in `work`."""
-    code = [path for name in _DEPENDS_ON for path in _modules(name)] + sorted(Path(__file__).parent.glob("fit_*.py"))
-    described = json.dumps([fit.case, fit.the_case.view, asdict(fit.the_case.settings), fit.seed, fit.variant])
-    key = fingerprint(described, fit.truth / "truth.npz", PRIOR, *code)
+def run_fit(fit: Fit, work: Path) -> dict:
+    """The result of a fit, which runs now unless `work` holds it: `refused`, the message of its InputError; or
+    `crashed`, the exit code; or `notes`, `face_mm`, `psnr_db`, `non_finite`, `closed` and `core_seconds`. A picture and
+    what the fit printed stay in `work`."""
+    case = fit.find_case()
+    described = json.dumps([fit.case, case.view, asdict(case.settings), fit.seed, fit.variant])
+    key = fingerprint(described, fit.truth / "truth.npz", PRIOR, *list_code())
     path = work / "fits" / f"{fit.case.replace(' ', '_')}_{fit.seed}.json"
     try:
-        return load_or_compute(path, key, lambda: _in_process(fit, path))
+        return load_or_compute(path, key, lambda: _run_in_process(fit, path))
     except CrashedError as error:
         return {"crashed": error.args[0]}
 
 
-def _modules(package: str) -> list[Path]:
-    (folder,) = find_spec(f"sira_mi.{package}").submodule_search_locations
-    return sorted(Path(folder).glob("*.py"))
+def list_code() -> list[Path]:
+    """The modules that the result of a fit depends on."""
+    packages = [importlib.import_module(f"sira_mi.{name}").__path__[0] for name in _DEPENDS_ON]
+    modules = [path for package in packages for path in sorted(Path(package).glob("*.py"))]
+    return modules + sorted(Path(__file__).parent.glob("fit_*.py"))
 
 
-def _in_process(fit: Fit, path: Path) -> dict:
-    """Runs `_fit` elsewhere, so that a crash ends nothing else. Raises CrashedError with the exit code."""
+def _run_in_process(fit: Fit, path: Path) -> dict:
+    """Runs `_fit` in another process, which may crash. Raises CrashedError with the exit code."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         process = multiprocessing.get_context("spawn").Process(target=_fit, args=(fit, path, Path(folder)))
@@ -82,25 +87,24 @@ def _fit(fit: Fit, path: Path, folder: Path) -> None:
     from studies.portraits.truth import load_truth  # its modules need the variant
 
     truth = load_truth(fit.truth / "truth.npz")
-    fed = fit.the_case.spoil(truth)
+    given = fit.find_case().corrupt(truth)
     try:
-        result = _scores(fit, fed, truth, path.with_suffix(".png"), folder)
+        result = _fit_and_score(fit, given, truth, path.with_suffix(".png"), folder)
     except InputError as error:
         result = {"refused": str(error).replace(f"{folder}{os.sep}", "")}
-    text = json.dumps({**result, "core_seconds": round(time.process_time(), 1)})
-    write_through(folder / "result.json", lambda file: file.write_text(text, encoding="utf-8"))
+    write_json(folder / "result.json", {**result, "core_seconds": round(time.process_time(), 1)})
 
 
-def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
-    """How whole the fitted avatar is, the face's mean error in mm after alignment (H3DS), and the PSNR in dB of its
-    picture against the photo that it was fed, inside the true mask."""
+def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path, folder: Path) -> dict:
+    """Whether the fitted avatar is finite and closed, the face's mean error in mm after alignment (H3DS), and the PSNR
+    in dB of its picture against the given photo, inside the true mask."""
     import trimesh
 
     from sira_mi.avatar.file import load_avatar, save_avatar
     from sira_mi.avatar.landmark_model import landmarks_of
     from sira_mi.fit import output
     from sira_mi.fit.driver import Progress
-    from sira_mi.fit.fit import FitRequest, finished_avatar, fit_portrait, initial_tensors, read_portrait, with_pose
+    from sira_mi.fit.fit import finished_avatar, fit_portrait, initial_tensors, read_portrait, with_pose
     from sira_mi.fit.settings import without
     from sira_mi.portrait.camera import Camera
     from sira_mi.portrait.load import linear_to_srgb
@@ -108,11 +112,11 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
     from sira_mi.relight.pictures import psnr_inside
     from studies.portraits.geometry_scores import GeometrySettings, PredictedHead, score_geometry
 
-    settings = fit.the_case.settings
-    if fed.camera is not None:
+    settings = fit.find_case().settings
+    if given.camera is not None:
         settings = without(settings, "pose")
     prior = load_avatar(PRIOR)
-    portrait = read_portrait(FitRequest(**fed.write(folder), out=folder), settings, prior)
+    portrait = read_portrait(given.write(folder), settings, prior)
     progress = Progress(initial_tensors(prior, fit.seed))
     fit_portrait(portrait, PRIOR, settings, fit.seed, folder, progress)
     avatar = finished_avatar(prior, progress, settings)
@@ -129,10 +133,10 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
     landmarks = landmarks_of(prior, head.field())
     height, width = truth.mask.shape
     scale = camera.width / width, camera.height / height
-    inside = truth.mask[::-1, ::-1] if fed.turned else truth.mask
+    inside = truth.mask[::-1, ::-1] if given.turned else truth.mask
     inside = area_resample(inside, (0, 0), scale, (camera.width, camera.height)) * (layers["mask"] > 0.99)
     camera = camera.scaled(1 / scale[0], 1 / scale[1], width, height)
-    if fed.turned:
+    if given.turned:
         camera = Camera(camera.K, np.diag([-1.0, -1.0, 1.0, 1.0]) @ camera.world_to_camera, width, height)
     sampling = GeometrySettings(samples=_GEOMETRY_SAMPLES, icp_points=2000)
     scores = score_geometry(PredictedHead(vertices, faces, landmarks, camera), truth, settings=sampling)
@@ -141,6 +145,6 @@ def _scores(fit: Fit, fed: Fed, truth, picture: Path, folder: Path) -> dict:
         "notes": progress.notes,
         "face_mm": scores["h3ds_face_mean"],
         "psnr_db": psnr_inside(layers["final"], portrait.image, inside),
-        "non_finite": non_finite(*tensors, *layers.values(), vertices),
+        "non_finite": count_non_finite(*tensors, *layers.values(), vertices),
         "closed": bool(trimesh.Trimesh(vertices, faces, process=False).is_watertight),
     }

@@ -20,7 +20,7 @@ _PHOTO = PhotoSettings(size=512, samples=64, depth=5, shading_samples=4)
 
 
 @cache
-def truth_portrait(folder: Path, view: str) -> Path:
+def take_portrait(folder: Path, view: str) -> Path:
     """The folder, inside `folder`, of the portrait `view` of `YAWS`, with its `photo.jpg` and `truth.npz`; it is taken
     now unless it is there already. Raises InputError when it cannot be written."""
     source = MakeHumanSource(NUMBER + 1, None)

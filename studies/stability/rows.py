@@ -1,4 +1,4 @@
-"""What a row of the table of numerical stability is, and the measures that rows share."""
+"""A row of the table of numerical stability, and the errors that rows are made of."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ class Row:
     """One row: what was measured, over how many cases, and what it must stay within."""
 
     name: str
-    meaning: str  # what is compared with what, the unit of the error, and why the bound is what it is
+    unit: str  # of the error
     cases: int
     error: float  # the worst over all cases
-    bound: float  # of the error, in its unit
+    bound: float  # of the error
     non_finite: int  # NaN and infinite values among the results
     gradients_finite: bool | None = None  # None where there is nothing to differentiate
+    note: str = ""  # a further figure, or what a fit said
 
     @property
     def passed(self) -> bool:
@@ -34,16 +35,7 @@ class Row:
 Measure = Callable[[bool], Row]
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of the page: a heading, what its rows share, and the functions that measure them."""
-
-    title: str
-    introduction: str
-    measures: tuple[Measure, ...]
-
-
-def non_finite(*values: np.ndarray) -> int:
+def count_non_finite(*values: np.ndarray) -> int:
     """How many values are NaN or infinite."""
     return sum(int(np.size(value) - np.isfinite(value).sum()) for value in values)
 
@@ -67,13 +59,13 @@ def peak_error(value: np.ndarray, exact: np.ndarray, peak: np.ndarray | float) -
     return largest(np.abs(value.astype(np.float64) - exact) / peak)
 
 
-def gradients_finite(function: Callable, *inputs) -> bool:
+def are_gradients_finite(function: Callable, *inputs) -> bool:
     """Whether the derivatives of the sum of `function(*inputs)` in all `inputs` are finite."""
     copies = [type(value)(value) for value in inputs]
     dr.enable_grad(copies)
     result = function(*copies)
     dr.backward(sum(dr.sum(part, axis=None) for part in _parts(result)))
-    return all(non_finite(dr.grad(value).numpy()) == 0 for value in copies)
+    return all(count_non_finite(dr.grad(value).numpy()) == 0 for value in copies)
 
 
 def _parts(result) -> Iterable:

@@ -1,4 +1,5 @@
-"""Rows on sampling: densities against float64, chi-squared tests, and the largest weights that samples may have."""
+"""Sampling of lights and of the reflectance: densities against float64, Mitsuba's chi-squared test, the energy of the
+samples, and the largest weight of a sample: a firefly is a weight that the model does not explain."""
 
 import contextlib
 import io
@@ -14,7 +15,7 @@ from sira_mi.sg import brdf
 from sira_mi.sg.sampling import LobeMixture, sample_lobe
 from studies.stability import cases
 from studies.stability.double import single
-from studies.stability.rows import Row, Section, largest, non_finite, relative_error
+from studies.stability.rows import Row, count_non_finite, largest, relative_error
 from studies.stability.spherical_gaussians import EXACT, exact_sphere_integral
 
 # Needle-sharp and nearly uniform lobes.
@@ -28,18 +29,19 @@ def _samples(quick: bool) -> int:
     return 30_000 if quick else 1_000_000
 
 
-def density(quick: bool) -> Row:
+def measure_density(quick: bool) -> Row:
+    """`LobeMixture.evaluate` against float64, where above 1e-6 of the mixture's highest lobe."""
     rng, points = np.random.default_rng(21), 300 if quick else 4000
     error, bad, total = 0.0, 0, 0
     for count in (1, 16, 1024):
-        lights = cases.lobe_sets(rng, count)
+        lights = cases.draw_lobes(rng, count)
         # Half of the directions lie in the reach of a lobe, which random ones never are for sharp lobes.
         chosen = rng.integers(0, count, points)
-        direction = cases.around(rng, lights[chosen, :3].T, lights[chosen, 3])
-        direction[:, ::2] = cases.directions(rng, points)[:, ::2]
+        direction = cases.draw_near(rng, lights[chosen, :3].T, lights[chosen, 3])
+        direction[:, ::2] = cases.draw_directions(rng, points)[:, ::2]
         radiance, density = LobeMixture(mi.TensorXf(lights.astype(np.float32))).evaluate(mi.Vector3f(direction))
         sharpness, amplitude = lights[:, 3], lights[:, 4:]
-        axis, unit = cases.unit(lights[:, :3].T), cases.unit(direction)
+        axis, unit = cases.normalise(lights[:, :3].T), cases.normalise(direction)
         gap = 0.5 * sum((unit[k][:, None] - axis[k]) ** 2 for k in range(3))
         value = np.exp(-sharpness * gap)
         integral = exact_sphere_integral(sharpness)
@@ -50,11 +52,11 @@ def density(quick: bool) -> Row:
             relative_error(density.numpy(), value @ scaled, scaled.max()),
             relative_error(radiance.numpy(), (value @ amplitude).T, amplitude.max()),
         )
-        bad += non_finite(radiance.numpy(), density.numpy())
+        bad += count_non_finite(radiance.numpy(), density.numpy())
         total += points
     return Row(
         "radiance and density of mixtures of 1, 16 and 1024 lobes",
-        "`LobeMixture.evaluate` against float64 where above 1e-6 of the mixture's highest lobe; relative.",
+        "relative",
         total,
         error,
         EXACT,
@@ -62,25 +64,25 @@ def density(quick: bool) -> Row:
     )
 
 
-def sampled_angles(quick: bool) -> Row:
+def measure_sampled_angles(quick: bool) -> Row:
+    """`sample_lobe` against the inverse of the distribution in float64, in widths of the lobe (1/√λ, at most one
+    radian). Bound: uniform numbers have 24 bits, so that the first angle off the axis is 3.5e-4 widths from it."""
     rng, count = np.random.default_rng(22), _samples(quick)
-    sharpness, axis = cases.sharpnesses(rng, count), cases.directions(rng, count)
+    sharpness, axis = cases.draw_sharpnesses(rng, count), cases.draw_directions(rng, count)
     u = single(rng.random((2, count)))
     direction = sample_lobe(mi.Vector3f(axis), mi.Float(sharpness), mi.Point2f(u)).numpy().astype(np.float64)
     safe = np.where(sharpness > 0.0, sharpness, 1.0)
     gap = np.where(sharpness > 1e-5, -np.log1p(u[0] * np.expm1(-2.0 * safe)) / safe, 2.0 * u[0])
     angle = 2.0 * np.arcsin(np.sqrt(np.clip(0.5 * gap, 0.0, 1.0)))
-    chord = np.linalg.norm(cases.unit(direction) - cases.unit(axis), axis=0)
+    chord = np.linalg.norm(cases.normalise(direction) - cases.normalise(axis), axis=0)
     difference = np.abs(2.0 * np.arcsin(np.clip(0.5 * chord, 0.0, 1.0)) - angle)
     return Row(
         "angle of a sample from its lobe's axis",
-        "`sample_lobe` against the inverse of the distribution in float64, in widths of the lobe (1/√λ, at most one "
-        "radian). Bound: 1e-3 of a width. The uniform numbers have 24 bits, so that the first angle beside the axis "
-        "is 3.5e-4 widths from it.",
+        "lobe widths",
         count,
         largest(difference * np.sqrt(np.maximum(sharpness, 1.0))),
         1e-3,
-        non_finite(direction),
+        count_non_finite(direction),
     )
 
 
@@ -95,7 +97,7 @@ def _run_tests(tests: list[ChiSquareTest]) -> tuple[float, float]:
 
 def _lobe_test(sharpness: float, count: int) -> ChiSquareTest:
     """Chi-squared test of an `sg_envmap` of one lobe, in 1 − cos θ (in units of 1/λ) and azimuth about its axis."""
-    axis = cases.unit(np.array([[0.3], [-0.5], [0.8]]))[:, 0]
+    axis = cases.normalise(np.array([[0.3], [-0.5], [0.8]]))[:, 0]
     scale = max(sharpness, 1.0)
     lights = np.array([[*axis, sharpness, 1.0, 1.0, 1.0]], np.float32)
     mixture, frame = LobeMixture(mi.TensorXf(lights)), mi.Frame3f(mi.Vector3f(*axis.tolist()))
@@ -117,15 +119,15 @@ def _lobe_test(sharpness: float, count: int) -> ChiSquareTest:
     )
 
 
-def lobe_chi_squared(quick: bool) -> Row:
+def measure_lobe_p_value(quick: bool) -> Row:
+    """Samples of single lobes of `_SHARPNESS` against their density, in coordinates about the axis. The bound lets all
+    tests together fail a correct sampler once in a hundred."""
     sharpness = (0.0, 1.0, 1e7) if quick else _SHARPNESS
     count = 100_000 if quick else 1_000_000
     error, bound = _run_tests([_lobe_test(x, count) for x in sharpness])
     return Row(
         "chi-squared: needle-sharp and nearly uniform lobes",
-        f"Samples of single lobes of sharpness {', '.join(f'{x:g}' for x in sharpness)} against the density that is "
-        "claimed for them, in coordinates about the axis. One minus the smallest p-value; its bound has all tests "
-        "together fail a correct sampler once in a hundred.",
+        "1 − p",
         count * len(sharpness),
         error,
         bound,
@@ -133,11 +135,13 @@ def lobe_chi_squared(quick: bool) -> Row:
     )
 
 
-def light_weights(quick: bool) -> Row:
+def measure_light_weights(quick: bool) -> Row:
+    """Radiance over density of `sg_envmap`'s samples. Lobes are chosen by the luminance of their energy, so that every
+    weight has the luminance of the whole light: the relative difference from that."""
     rng, points = np.random.default_rng(23), 3000 if quick else 100_000
     error, bad, total = 0.0, 0, 0
     for count in (1, 16, 1024):
-        lights = cases.lobe_sets(rng, count)
+        lights = cases.draw_lobes(rng, count)
         lights[:, 3] = np.maximum(lights[:, 3], cases.SHARPNESS[0])  # a file's lobes are not constant
         light = mi.load_dict({"type": "sg_envmap", "lobes": mi.TensorXf(lights.astype(np.float32))})
         energy = exact_sphere_integral(single(lights[:, 3])) @ (lights[:, 4:] @ LUMINANCE)
@@ -145,13 +149,11 @@ def light_weights(quick: bool) -> Row:
         ds, weight = light.sample_direction(it, mi.Point2f(rng.random((2, points))))
         luminance = np.array(LUMINANCE) @ weight.numpy()
         error = max(error, largest(np.abs(luminance / energy - 1.0)))
-        bad += non_finite(weight.numpy(), ds.pdf.numpy())
+        bad += count_non_finite(weight.numpy(), ds.pdf.numpy())
         total += points
     return Row(
         "fireflies: weights of light samples",
-        "Radiance over density of `sg_envmap`'s samples. Lobes are chosen by the luminance of their energy, so that "
-        "the luminance of every weight is that of the whole light: the largest over the mean is 1. Relative "
-        "difference from that, under 1, 16 and 1024 lobes of amplitudes 0 to 1e6.",
+        "relative",
         total,
         error,
         EXACT,
@@ -180,11 +182,12 @@ def _settings(quick: bool):
     return [(a, r, *albedos) for a in angles for r in roughnesses for albedos in ((0.0, 1.0), (0.8, 0.0), (0.5, 0.5))]
 
 
-def reflectance_weights(quick: bool) -> Row:
-    """The mixture's weight is below the larger of its parts' weights, and those have closed bounds."""
+def measure_reflectance_weights(quick: bool) -> Row:
+    """Value times cosine over density of `sira_bsdf`'s samples, as a share of what the model allows. With p the
+    probability of the specular lobe, the diffuse part's weight is at most a/(1 − p), the specular part's at most 1/(p
+    (n·v (1 − k) + k)), k = (r + 1)²/8, and the mixture's at most the larger of the two."""
     rng, count = np.random.default_rng(24), 3000 if quick else 100_000
     error, bad, ratio, settings = 0.0, 0, 0.0, _settings(quick)
-    roughnesses = sorted({s[1] for s in settings})
     for angle, roughness, diffuse, specular in settings:
         plugin, si = _bsdf(diffuse, specular, roughness), _interaction(angle, count)
         u = rng.random((3, count))
@@ -196,18 +199,15 @@ def reflectance_weights(quick: bool) -> Row:
         weight = weight.numpy()
         error = max(error, largest(weight) / bound)
         ratio = max(ratio, largest(weight) / max(float(weight.mean()), 1e-9))
-        bad += non_finite(weight, samples.pdf.numpy(), samples.wo.numpy())
+        bad += count_non_finite(weight, samples.pdf.numpy(), samples.wo.numpy())
     return Row(
         "fireflies: weights of BSDF samples",
-        "Value times cosine over density of `sira_bsdf`'s samples, as a share of what the model allows. With p the "
-        "probability of the specular lobe, the diffuse part's weight is at most a/(1 − p), the specular part's at most "
-        "1/(p (n·v (1 − k) + k)), k = (r + 1)²/8, and that of both at most the larger. Views of "
-        f"{', '.join(f'{a:g}°' for a in dict.fromkeys(s[0] for s in settings))}, roughness {roughnesses[0]:g} to "
-        f"{roughnesses[-1]:g}. The largest weight was {ratio:.1f} times its mean.",
+        "of the limit",
         count * len(settings),
         error,
         1.0 + EXACT,
         bad,
+        note=f"the largest is {ratio:.1f} times the mean",
     )
 
 
@@ -230,8 +230,10 @@ def _albedo(angle: float, roughness: float, diffuse: float, specular: float, siz
     return diffuse + float(np.where(above, weight, 0.0).mean())
 
 
-def reflectance_energy(quick: bool) -> Row:
-    """Sampled albedo against a sum in float64: what chi-squared on the sphere cannot resolve for sharp lobes."""
+def measure_reflectance_energy(quick: bool) -> Row:
+    """Mean weight of `sira_bsdf`'s samples against the model's directional albedo, summed over half vectors in float64:
+    what chi-squared on the sphere cannot resolve for sharp lobes. In standard errors plus 0.1% of the albedo; a normal
+    variable exceeds 4.5 once in 150,000."""
     rng, side = np.random.default_rng(25), 128 if quick else 512
     grid = (np.stack(np.meshgrid(np.arange(side), np.arange(side))).reshape(2, -1) + 0.5) / side
     error, bad, settings = 0.0, 0, _settings(quick)
@@ -242,11 +244,10 @@ def reflectance_energy(quick: bool) -> Row:
         weight = plugin.sample(mi.BSDFContext(), si, mi.Float(u), mi.Point2f(grid))[1].x.numpy().astype(np.float64)
         exact = _albedo(angle, roughness, diffuse, specular, 500 if quick else 1000)
         error = max(error, abs(weight.mean() - exact) / (weight.std() / side + 1e-3 * exact))
-        bad += non_finite(weight)
+        bad += count_non_finite(weight)
     return Row(
         "energy of BSDF samples from head-on to 89.9°",
-        "Mean weight of `sira_bsdf`'s samples against the model's directional albedo, summed over half vectors in "
-        "float64; in standard errors plus 0.1% of the albedo. Bound: a normal variable exceeds 4.5 once in 150,000.",
+        "standard errors",
         side * side * len(settings),
         error,
         4.5,
@@ -254,8 +255,9 @@ def reflectance_energy(quick: bool) -> Row:
     )
 
 
-def reflectance_chi_squared(quick: bool) -> Row:
-    # Sharper or lower, and the density has peaks at the horizon that the test's own quadrature does not resolve.
+def measure_reflectance_p_value(quick: bool) -> Row:
+    """`sira_bsdf` at grazing angles, as `measure_lobe_p_value`. For sharper lobes or lower angles the density has peaks
+    at the horizon that the test's own quadrature does not resolve."""
     settings = ((75.0, 0.2), (85.0, 0.2), (85.0, 0.5), (89.0, 0.5), (89.0, 1.0), (89.9, 1.0))
     settings = settings[3:4] if quick else settings
     count, tests = 100_000 if quick else 400_000, []
@@ -266,7 +268,7 @@ def reflectance_chi_squared(quick: bool) -> Row:
     error, bound = _run_tests(tests)
     return Row(
         "chi-squared: BSDF at grazing angles",
-        "`sira_bsdf` seen at " + ", ".join(f"{a:g}° (r = {r:g})" for a, r in settings) + ", as for lobes above.",
+        "1 − p",
         count * len(settings),
         error,
         bound,
@@ -274,18 +276,12 @@ def reflectance_chi_squared(quick: bool) -> Row:
     )
 
 
-SECTION = Section(
-    "Sampling",
-    "Of lights and of the reflectance. Densities are exact operations. Sampling is tested by Mitsuba's chi-squared "
-    "test, by its energy, and by the largest weight that a sample gets: a firefly is a weight that the model does not "
-    "explain.",
-    (
-        density,
-        sampled_angles,
-        lobe_chi_squared,
-        light_weights,
-        reflectance_weights,
-        reflectance_energy,
-        reflectance_chi_squared,
-    ),
+MEASURES = (
+    measure_density,
+    measure_sampled_angles,
+    measure_lobe_p_value,
+    measure_light_weights,
+    measure_reflectance_weights,
+    measure_reflectance_energy,
+    measure_reflectance_p_value,
 )

@@ -1,18 +1,17 @@
-"""The page's sections in order, by the names of their modules: a new subject is a module with a `SECTION`, or a
-`section(work)` where something is kept on disk, added here."""
+"""The sections of the page in order: a new subject is a module with `MEASURES`, added here and to `template.md`."""
 
 from pathlib import Path
 
 from studies.stability import fits, sampling, spherical_gaussians, tracing
-from studies.stability.rows import Section
+from studies.stability.rows import Measure
 
-SECTIONS = {
-    "spherical_gaussians": spherical_gaussians.SECTION,
-    "sampling": sampling.SECTION,
-    "tracing": tracing.SECTION,
+NUMERICS: dict[str, tuple[Measure, ...]] = {
+    "spherical_gaussians": spherical_gaussians.MEASURES,
+    "sampling": sampling.MEASURES,
+    "tracing": tracing.MEASURES,
 }
 
 
-def all_sections(work: Path) -> dict[str, Section]:
-    """Those and the fits, which are kept in the folder `work`."""
-    return {**SECTIONS, "fits": fits.section(work)}
+def list_sections(work: Path) -> dict[str, tuple[Measure, ...]]:
+    """All of them with the fits, which are kept in the folder `work`."""
+    return {**NUMERICS, "fits": fits.list_measures(work)}

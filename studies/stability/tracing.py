@@ -1,4 +1,8 @@
-"""Rows on rays against signed distance fields: hits against dense bisection of the same field in float64."""
+"""Rays against signed distance fields: the hits against dense bisection of the same field in float64.
+
+Heads are traced as the integrators trace them: the mesh's hit, then Newton steps on the field. Gradients are those of
+the hit by the reference network and the latent. Thin features are fields made by hand and traced from a start beside
+them, as the mesh shows only what its grid (`voxel`, 5 mm) meets."""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ from sira_mi.fields.mlp import SOFTPLUS_SHARPNESS
 from sira_mi.fields.sdf import SdfField
 from studies.stability import cases
 from studies.stability.fields64 import Field64, box_interval
-from studies.stability.rows import Row, Section, largest, non_finite
+from studies.stability.rows import Row, count_non_finite, largest
 
 # mm: how far a hit may lie from the surface.
 HIT = 0.01
@@ -35,7 +39,7 @@ _HALF_THICKNESS = 0.004  # scene units, of sheets and threads: 0.8 mm in all
 # Heads
 
 
-def _shifted(avatar, scale: float = 1.0, offset: float = 0.0, sigma: float = 0.0, seed: int = 0):
+def _change(avatar, scale: float = 1.0, offset: float = 0.0, sigma: float = 0.0, seed: int = 0):
     """An avatar whose field is `scale` times the given one's plus `offset`, at `sigma` deviations of the latent."""
     tensors = {name: value.copy() for name, value in avatar.tensors.items()}
     last = avatar.architecture.networks["reference"].width + 1
@@ -47,7 +51,7 @@ def _shifted(avatar, scale: float = 1.0, offset: float = 0.0, sigma: float = 0.0
     return dataclasses.replace(avatar, tensors=tensors)
 
 
-def _load(avatar, voxel: float):
+def _load_head(avatar, voxel: float):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "avatar.safetensors"
         save_avatar(path, avatar)
@@ -58,7 +62,7 @@ def _load(avatar, voxel: float):
 @functools.cache
 def _scene(quick: bool, **change):
     """A scene of the shipped prior's head, changed; extracted on a coarse grid for the quick version."""
-    return _load(_shifted(load_avatar(), **change), 0.2 if quick else 0.05)
+    return _load_head(_change(load_avatar(), **change), 0.2 if quick else 0.05)
 
 
 def _head(scene):
@@ -70,39 +74,39 @@ def _head(scene):
 # Rays: origins and directions [3, n], as single precision holds them
 
 
-def _rays(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(np.ascontiguousarray(a, np.float32).astype(np.float64) for a in (origin, cases.unit(direction)))
+def _round_rays(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(np.ascontiguousarray(a, np.float32).astype(np.float64) for a in (origin, cases.normalise(direction)))
 
 
-def camera_rays(rng: np.random.Generator, count: int, distance: float, degrees: float):
+def draw_camera_rays(rng: np.random.Generator, count: int, distance: float, degrees: float):
     """From all around at `distance` (scene units) from the origin, through a square lens of `degrees`."""
-    back = cases.directions(rng, count)
-    right = cases.across(rng, back)
+    back = cases.draw_directions(rng, count)
+    right = cases.draw_perpendicular(rng, back)
     up = np.cross(back.T, right.T).T
     x, y = np.tan(np.radians(degrees) / 2.0) * rng.uniform(-1.0, 1.0, (2, count))
-    return _rays(distance * back, -back + x * right + y * up)
+    return _round_rays(distance * back, -back + x * right + y * up)
 
 
-def inner_rays(rng: np.random.Generator, count: int):
+def draw_inner_rays(rng: np.random.Generator, count: int):
     """From points inside the head."""
-    return _rays(rng.uniform(-0.4, 0.4, (3, count)), cases.directions(rng, count))
+    return _round_rays(rng.uniform(-0.4, 0.4, (3, count)), cases.draw_directions(rng, count))
 
 
-def tangent_rays(rng: np.random.Generator, count: int, scene):
+def draw_tangent_rays(rng: np.random.Generator, count: int, scene):
     """Past points of the surface, at right angles to the normal, up to 0.1 mm inside or outside."""
     field = Field64.of(_head(scene).field())
     vertices = _head(scene).vertices().astype(np.float64)
     on_surface = vertices[:, np.abs(field.value(vertices)) < 1e-4]
     x = on_surface[:, rng.integers(0, on_surface.shape[1], count)]
-    normal = cases.unit(field.gradient(x))
-    along = cases.across(rng, normal)
-    return _rays(x + rng.uniform(-1e-3, 1e-3, count) * normal - 6.0 * along, along)
+    normal = cases.normalise(field.gradient(x))
+    along = cases.draw_perpendicular(rng, normal)
+    return _round_rays(x + rng.uniform(-1e-3, 1e-3, count) * normal - 6.0 * along, along)
 
 
 # Measures
 
 
-def hit_errors(field: Field64, origin, direction, t) -> np.ndarray:
+def measure_hit_errors(field: Field64, origin, direction, t) -> np.ndarray:
     """Distance in mm of hits t [N] from the surface: from the plane that touches it at the ray's nearest crossing, or,
     for rays that graze it or touch it without a crossing between samples, |f| / |∇f|."""
     samples = t + np.linspace(-_WINDOW, _WINDOW, 2 * _WINDOW_SAMPLES + 1)[:, None]
@@ -128,7 +132,7 @@ class Traced:
     gradients_finite: bool
 
 
-def _hits(scene, origin, direction) -> tuple[np.ndarray, np.ndarray]:
+def _trace_head(scene, origin, direction) -> tuple[np.ndarray, np.ndarray]:
     """Ray parameters [N] and whether there is a hit [N], as the integrators have them."""
     from sira_mi.plugins.neural_sdf import trace_head
 
@@ -137,18 +141,18 @@ def _hits(scene, origin, direction) -> tuple[np.ndarray, np.ndarray]:
     return t.astype(np.float64), hit
 
 
-def _trace(scene, origin, direction) -> Traced:
-    t, hit = _hits(scene, origin, direction)
+def _trace_and_score(scene, origin, direction) -> Traced:
+    t, hit = _trace_head(scene, origin, direction)
     arguments = origin[:, hit], direction[:, hit], t[hit]
-    errors = hit_errors(Field64.of(_head(scene).field()), *arguments)
-    finite = _hit_gradients_finite(_head(scene), *arguments)
-    return Traced(int(hit.sum()), largest(errors), non_finite(t[hit]), finite)
+    errors = measure_hit_errors(Field64.of(_head(scene).field()), *arguments)
+    finite = _are_hit_gradients_finite(_head(scene), *arguments)
+    return Traced(int(hit.sum()), largest(errors), count_non_finite(t[hit]), finite)
 
 
-def strangers(scene, origin, direction, step: float) -> int:
+def count_wrong_hits(scene, origin, direction, step: float) -> int:
     """Rays that have a hit more than 2 mm from the field's first crossing, a hit where there is no crossing, or no hit
     where there is one. Rays that enter the box within the solid are left out. Samples are `step` apart."""
-    t, hit = _hits(scene, origin, direction)
+    t, hit = _trace_head(scene, origin, direction)
     field = Field64.of(_head(scene).field())
     near, far = box_interval(origin, direction)
     length = np.linalg.norm(np.array(DOMAIN_UPPER) - DOMAIN_LOWER)
@@ -161,7 +165,7 @@ def strangers(scene, origin, direction, step: float) -> int:
     return int((differs & (field.value(origin + near * direction) > 0.0)).sum())
 
 
-def _hit_gradients_finite(head, origin, direction, t) -> bool:
+def _are_hit_gradients_finite(head, origin, direction, t) -> bool:
     """Whether the derivatives of the hits by the reference network and the latent are finite."""
     keys = ("reference", "z_sdf")
     before = {key: getattr(head, key) for key in keys}
@@ -171,7 +175,7 @@ def _hit_gradients_finite(head, origin, direction, t) -> bool:
         setattr(head, key, value)
     columns = [mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (origin, direction, t[None])]
     dr.backward(dr.sum(tracing.differentiable_hit(head.field(), *columns), axis=None))
-    finite = all(non_finite(dr.grad(getattr(head, key)).numpy()) == 0 for key in keys)
+    finite = all(count_non_finite(dr.grad(getattr(head, key)).numpy()) == 0 for key in keys)
     for key in keys:
         setattr(head, key, before[key])
     return finite
@@ -181,76 +185,69 @@ def _count(quick: bool) -> int:
     return 60 if quick else 1500
 
 
-_DISTANCE = (
-    "Distance of every hit from the surface of the same field in float64: from the tangent plane where the ray, "
-    "bisected, crosses it, or |f|/|∇f| for rays within 6° of it; mm."
-)
+def _measure_hits(name: str, scene, rays: tuple[np.ndarray, np.ndarray]) -> Row:
+    """Distance of every hit from the surface of the same field in float64, as `measure_hit_errors`."""
+    traced = _trace_and_score(scene, *rays)
+    return Row(name, "mm", traced.hits, traced.error, HIT, traced.non_finite, traced.gradients_finite)
 
 
-def _row(name: str, meaning: str, traced: Traced) -> Row:
-    meaning = f"{_DISTANCE} {meaning}".strip()
-    return Row(name, meaning, traced.hits, traced.error, HIT, traced.non_finite, traced.gradients_finite)
-
-
-def _portrait(quick: bool, name: str, meaning: str, **change) -> Row:
+def _measure_portrait(quick: bool, name: str, **change) -> Row:
     """Rays of a portrait lens, 0.6 m away, against a changed head."""
-    scene = _scene(quick, **change)
-    rays = camera_rays(np.random.default_rng(31), _count(quick), 6.0, 40.0)
-    return _row(name, meaning, _trace(scene, *rays))
+    rays = draw_camera_rays(np.random.default_rng(31), _count(quick), 6.0, 40.0)
+    return _measure_hits(name, _scene(quick, **change), rays)
 
 
-def plain(quick: bool) -> Row:
-    return _portrait(quick, "the prior's mean head, from 0.6 m", "")
+def measure_plain_head(quick: bool) -> Row:
+    return _measure_portrait(quick, "the prior's mean head, from 0.6 m")
 
 
-def stiff(quick: bool) -> Row:
-    return _portrait(quick, "the field times 10", "A gradient of length 10, not 1.", scale=10.0)
+def measure_steep_field(quick: bool) -> Row:
+    """A gradient of length 10 instead of 1."""
+    return _measure_portrait(quick, "the field times 10", scale=10.0)
 
 
-def flat(quick: bool) -> Row:
-    return _portrait(quick, "the field times 0.1", "A gradient of length 0.1, not 1.", scale=0.1)
+def measure_flat_field(quick: bool) -> Row:
+    """A gradient of length 0.1 instead of 1."""
+    return _measure_portrait(quick, "the field times 0.1", scale=0.1)
 
 
-def extreme_latents(quick: bool) -> Row:
-    return _portrait(
-        quick, "latent at 5σ", "A normal sample, five times as long: no head any more, but a field.", sigma=5.0, seed=1
-    )
+def measure_extreme_latent(quick: bool) -> Row:
+    """A normal sample, five times as long: no longer a head, but a field."""
+    return _measure_portrait(quick, "latent at 5σ", sigma=5.0, seed=1)
 
 
-def tangent(quick: bool) -> Row:
+def measure_tangent_rays(quick: bool) -> Row:
+    """Lines up to 0.1 mm above or below points of the surface."""
     scene = _scene(quick)
-    rays = tangent_rays(np.random.default_rng(32), _count(quick), scene)
-    return _row("tangent rays", "Lines up to 0.1 mm above or below points of the surface.", _trace(scene, *rays))
+    return _measure_hits("tangent rays", scene, draw_tangent_rays(np.random.default_rng(32), _count(quick), scene))
 
 
-def inside(quick: bool) -> Row:
-    rays = inner_rays(np.random.default_rng(33), _count(quick))
-    return _row("camera inside the head", "", _trace(_scene(quick), *rays))
+def measure_inner_rays(quick: bool) -> Row:
+    rays = draw_inner_rays(np.random.default_rng(33), _count(quick))
+    return _measure_hits("camera inside the head", _scene(quick), rays)
 
 
-def far_away(quick: bool) -> Row:
-    rays = camera_rays(np.random.default_rng(34), _count(quick), 1000.0, 1.0 / 4.0)
-    return _row(
-        "camera at 100 m, within a 1° lens",
-        "Ray parameters there are 0.006 mm apart in single precision.",
-        _trace(_scene(quick), *rays),
-    )
+def measure_far_camera(quick: bool) -> Row:
+    """Ray parameters are 0.006 mm apart there in single precision."""
+    rays = draw_camera_rays(np.random.default_rng(34), _count(quick), 1000.0, 1.0 / 4.0)
+    return _measure_hits("camera at 100 m, within a 1° lens", _scene(quick), rays)
 
 
-def wide_lens(quick: bool) -> Row:
-    rays = camera_rays(np.random.default_rng(35), 2 * _count(quick), 2.6, 120.0)
-    return _row("120° lens, 0.26 m from the centre", "", _trace(_scene(quick), *rays))
+def measure_wide_lens(quick: bool) -> Row:
+    rays = draw_camera_rays(np.random.default_rng(35), 2 * _count(quick), 2.6, 120.0)
+    return _measure_hits("120° lens, 0.26 m from the centre", _scene(quick), rays)
 
 
-def another_surface(quick: bool) -> Row:
+def measure_wrong_surfaces(quick: bool) -> Row:
+    """Rays whose hit is not within 2 mm of the field's first crossing in float64, that have a hit where there is no
+    crossing, or the reverse. The mesh decides where a ray first meets the field, and at the outline it is off by a
+    chord's height: the bound is 0.5% on the 5 mm grid, 2% on the 20 mm grid of the quick version."""
     scene, rng, count = _scene(quick), np.random.default_rng(36), _count(quick)
-    rays = [camera_rays(rng, count, *lens) for lens in ((6.0, 40.0), (1000.0, 0.25))]
-    share = sum(strangers(scene, *r, 0.1 if quick else 0.04) for r in rays) / (2 * count)
+    rays = [draw_camera_rays(rng, count, *lens) for lens in ((6.0, 40.0), (1000.0, 0.25))]
+    share = sum(count_wrong_hits(scene, *r, 0.1 if quick else 0.04) for r in rays) / (2 * count)
     return Row(
         "rays that hit another surface, or none",
-        "Share of rays whose hit is not within 2 mm of the field's first crossing in float64, or that have a hit where "
-        "there is no crossing, or the reverse. The mesh decides where a ray meets the field first, and it is a chord's "
-        "height off at the outline: bound 0.5% on the 5 mm grid (2% in the quick version, on 20 mm).",
+        "of the rays",
         2 * count,
         share,
         0.02 if quick else 0.005,
@@ -292,64 +289,66 @@ def _plateau() -> SdfField:
     return _field([[-1.0, 0.0, 0.0]], [0.0], [-1.0], _softplus(0.1))
 
 
-def _hand_made(name: str, meaning: str, field: SdfField, origin, direction, start, found: float) -> Row:
-    """A row on rays that all meet the field, traced from `start` [n]; `found` is the share that has to be found."""
+def _measure_hand_made(name: str, field: SdfField, origin, direction, start, found: float) -> Row:
+    """Rays that all meet the field, traced from `start` [n]; finding less than a share of `found` is an infinite
+    error."""
     columns = [np.ascontiguousarray(a, np.float32) for a in (origin, direction, start[None])]
     t, f = tracing.refined_hits(field, *columns)
     hit = np.abs(f[0]) < tracing.HIT_TOLERANCE
     reference = Field64.of(field)
     o, d = (c.astype(np.float64)[:, hit] for c in columns[:2])
-    errors = hit_errors(reference, o, d, t[0, hit].astype(np.float64))
+    errors = measure_hit_errors(reference, o, d, t[0, hit].astype(np.float64))
     dr.enable_grad(field.reference[0][0], field.reference[1][0])
     hits = [mi.TensorXf(np.ascontiguousarray(c[:, hit])) for c in (*columns[:2], t)]
     dr.backward(dr.sum(tracing.differentiable_hit(field, *hits), axis=None))
-    finite = all(non_finite(dr.grad(layer[0]).numpy()) == 0 for layer in field.reference)
+    finite = all(count_non_finite(dr.grad(layer[0]).numpy()) == 0 for layer in field.reference)
     share = float(hit.mean())
     error = largest(errors) if share >= found else np.inf
-    meaning += f" {100 * share:.1f}% of the rays found it; less than {100 * found:.0f}% counts as an infinite error."
-    meaning = f"{_DISTANCE} {meaning}"
-    return Row(name, meaning, hit.size, error, HIT, non_finite(t[:, hit], f), finite)
+    note = f"found by {100 * share:.1f}% of the rays"
+    return Row(name, "mm", hit.size, error, HIT, count_non_finite(t[:, hit], f), finite, note)
 
 
-def _thin(quick: bool, name: str, meaning: str, field: SdfField, normal: np.ndarray, found: float) -> Row:
+def _measure_thin(quick: bool, name: str, field: SdfField, normal: np.ndarray, found: float) -> Row:
+    """Traced from starts up to 5 mm in front of the feature."""
     rng, count = np.random.default_rng(37), 300 if quick else 5000
     target = rng.uniform(-1.0, 1.0, (3, count))
     target -= normal * (normal * target).sum(axis=0)
     if field.reference[0][0].shape[0] == 4:
         target *= np.array([[0.0], [1.0], [0.0]])
-    origin = 6.0 * cases.directions(rng, count)
+    origin = 6.0 * cases.draw_directions(rng, count)
     direction = target - origin
-    steep = np.abs((cases.unit(direction) * normal).sum(axis=0)) > 0.2
-    origin, direction = _rays(origin[:, steep], direction[:, steep])
+    steep = np.abs((cases.normalise(direction) * normal).sum(axis=0)) > 0.2
+    origin, direction = _round_rays(origin[:, steep], direction[:, steep])
     start = np.linalg.norm(target[:, steep] - origin, axis=0) - rng.uniform(0.0, 0.05, int(steep.sum()))
-    return _hand_made(name, meaning, field, origin, direction, start, found)
+    return _measure_hand_made(name, field, origin, direction, start, found)
 
 
-def thin_sheet(quick: bool) -> Row:
-    meaning = "Gradients of length 0.2 on the faces, 0 in the middle. From starts up to 5 mm in front of it."
-    return _thin(quick, "a sheet 0.8 mm thick", meaning, _sheet(), np.array([[0.6], [0.0], [0.8]]), 0.9)
+def measure_thin_sheet(quick: bool) -> Row:
+    """Gradients of length 0.2 on the faces, 0 in the middle."""
+    return _measure_thin(quick, "a sheet 0.8 mm thick", _sheet(), np.array([[0.6], [0.0], [0.8]]), 0.9)
 
 
-def thin_thread(quick: bool) -> Row:
-    meaning = "Rays towards its axis, from starts up to 5 mm in front of it."
-    return _thin(quick, "a thread 0.8 mm thick", meaning, _thread(), np.array([[0.0], [0.0], [1.0]]), 0.9)
+def measure_thin_thread(quick: bool) -> Row:
+    """Rays towards its axis."""
+    return _measure_thin(quick, "a thread 0.8 mm thick", _thread(), np.array([[0.0], [0.0], [1.0]]), 0.9)
 
 
-def zero_gradient(quick: bool) -> Row:
+def measure_zero_gradient(quick: bool) -> Row:
+    """The field is constant where the rays start: Newton steps have no slope to follow."""
     rng, count = np.random.default_rng(38), 300 if quick else 5000
     target = np.concatenate([np.full((1, count), -0.1), rng.uniform(-1.0, 1.0, (2, count))])
-    direction = cases.unit(np.stack([np.full(count, -1.0), *rng.uniform(-1.0, 1.0, (2, count))]))
+    direction = cases.normalise(np.stack([np.full(count, -1.0), *rng.uniform(-1.0, 1.0, (2, count))]))
     distance = (0.1 + rng.uniform(0.02, 0.2, count)) / -direction[0]
-    origin, direction = _rays(target - 6.0 * direction, direction)
-    meaning = "The field is constant where the rays start, so that Newton steps have no slope to follow."
-    return _hand_made("starts of zero gradient", meaning, _plateau(), origin, direction, 6.0 - distance, 0.99)
+    origin, direction = _round_rays(target - 6.0 * direction, direction)
+    return _measure_hand_made("starts of zero gradient", _plateau(), origin, direction, 6.0 - distance, 0.99)
 
 
-def bounded_evaluations(quick: bool) -> Row:
-    """The longest way that a ray can go: Newton steps, the whole search, Newton steps again."""
+def count_evaluations(quick: bool) -> Row:
+    """Mean over the rays of an empty field (5 everywhere), the sheet, the thread or the plateau, whichever is largest.
+    The longest way of a ray: Newton steps, the whole search, Newton steps again; all rays step together."""
     count = 1024  # a size that chunks are not filled up to
     rng = np.random.default_rng(39)
-    columns = [np.float32(rng.standard_normal((3, count))), np.float32(cases.directions(rng, count))]
+    columns = [np.float32(rng.standard_normal((3, count))), np.float32(cases.draw_directions(rng, count))]
     calls, bad = 0, 0
     for field in (_field([[0.0] * 3], [0.0], [0.0], 5.0), _sheet(), _thread(), _plateau()):
         with (
@@ -359,13 +358,10 @@ def bounded_evaluations(quick: bool) -> Row:
             t, f = tracing.refined_hits(field, *columns, np.ones((1, count), np.float32))
         columns_evaluated = sum(call.args[1].shape[1] for spy in (value, slope) for call in spy.call_args_list)
         calls = max(calls, columns_evaluated / count)
-        bad += non_finite(t, f)
+        bad += count_non_finite(t, f)
     return Row(
         "evaluations of the field for one ray",
-        "The mean over the rays of an empty field (5 everywhere), the sheet, the thread or the plateau, whichever is "
-        "largest: the empty field's, where every ray takes all that there are. All rays step together, so that the "
-        f"bound of {tracing.MAXIMUM_EVALUATIONS} holds for every field: three times five of Newton's method, and 64 of "
-        "the search.",
+        "evaluations",
         4 * count,
         calls,
         tracing.MAXIMUM_EVALUATIONS,
@@ -373,49 +369,42 @@ def bounded_evaluations(quick: bool) -> Row:
     )
 
 
-def empty_sets(quick: bool) -> Row:
+def count_hits_of_empty_sets(quick: bool) -> Row:
+    """Heads without a surface that are not refused by name, and rays that hit a field of 5 everywhere."""
     refused, offsets = 0, (20.0, 1e3, 1e6)
     for offset in offsets:
         try:
-            _load(_shifted(load_avatar(), offset=offset), 0.2)
+            _load_head(_change(load_avatar(), offset=offset), 0.2)
         except Exception as error:
             refused += EmptySurfaceError.__name__ in repr(error) or "no surface" in str(error)
     field = _field([[0.0] * 3], [0.0], [0.0], 5.0)
     rng, count = np.random.default_rng(40), 1000
-    origin, direction = camera_rays(rng, count, 6.0, 40.0)
+    origin, direction = draw_camera_rays(rng, count, 6.0, 40.0)
     columns = [np.float32(origin), np.float32(direction), np.full((1, count), 6.0, np.float32)]
     t, f = tracing.refined_hits(field, *columns)
     return Row(
         "empty zero sets",
-        "Heads without a surface that are not refused by name, and rays that hit a field of 5 everywhere.",
+        "heads and rays",
         len(offsets) + count,
         len(offsets) - refused + int((np.abs(f) < tracing.HIT_TOLERANCE).sum()),
         0.0,
-        non_finite(t, f),
+        count_non_finite(t, f),
     )
 
 
-SECTION = Section(
-    "Signed distance fields and tracing",
-    "Rays through `neural_sdf` as the integrators trace them: the mesh's hit, then Newton steps on the field. A hit "
-    "must lie within 0.01 mm of the surface, which is bisected in float64, by an independent NumPy version of the same "
-    "networks, between dense samples along the ray. Gradients are those of the hit by the reference network and the "
-    "latent. Thin features are fields made by hand, traced from a start beside them: the mesh shows only what its grid "
-    "(`voxel`, 5 mm) meets, and a feature that is thinner than that may be missing from it.",
-    (
-        plain,
-        stiff,
-        flat,
-        extreme_latents,
-        tangent,
-        inside,
-        far_away,
-        wide_lens,
-        another_surface,
-        thin_sheet,
-        thin_thread,
-        zero_gradient,
-        bounded_evaluations,
-        empty_sets,
-    ),
+MEASURES = (
+    measure_plain_head,
+    measure_steep_field,
+    measure_flat_field,
+    measure_extreme_latent,
+    measure_tangent_rays,
+    measure_inner_rays,
+    measure_far_camera,
+    measure_wide_lens,
+    measure_wrong_surfaces,
+    measure_thin_sheet,
+    measure_thin_thread,
+    measure_zero_gradient,
+    count_evaluations,
+    count_hits_of_empty_sets,
 )
