@@ -418,10 +418,3 @@ def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
         (tmp_path / "benchmark.json").write_text(text)
         with pytest.raises(InputError, match=r"benchmark\.json"):
             benchmark.read_benchmark(tmp_path)
-
-
-def test_the_page_lists_the_truth():
-    """The table of `docs/benchmark.md` is `TRUTH`."""
-    page = (Path(__file__).resolve().parent.parent / "docs" / "benchmark.md").read_text(encoding="utf-8")
-    for name, content in benchmark.TRUTH.items():
-        assert f"| `{name}` | {content} |" in page, name

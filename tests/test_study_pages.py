@@ -7,15 +7,35 @@ import pytest
 
 from sira_mi.errors import InputError
 from studies.data import read_figures, write_figures
+from studies.markdown import number, table
 from studies.portraits import page
 from studies.portraits.compare_methods import MEAN_HEAD
 from studies.portraits.summary import APPEARANCE_SCORES, GEOMETRY_SCORES, summarise
+from studies.priors import page as prior_page
+from studies.priors.summary import summarise as summarise_prior
 
 DOCS = Path(__file__).parents[1] / "docs"
 
 
 def test_the_results_page_is_written_from_its_figures():
     assert (DOCS / "results.md").read_text(encoding="utf-8") == page.render_page(read_figures(DOCS / page.FIGURES))
+
+
+def test_the_pages_of_the_priors_are_written_from_their_figures():
+    for name, text in prior_page.render_pages(read_figures(DOCS / prior_page.FIGURES)).items():
+        assert (DOCS / name).read_text(encoding="utf-8") == text
+
+
+def test_a_page_without_measurements_says_which_command_makes_them(tmp_path):
+    write_figures(tmp_path / prior_page.FIGURES, summarise_prior(tmp_path))
+    pages = prior_page.render_pages(read_figures(tmp_path / prior_page.FIGURES))
+    assert pages["priors.md"].count("Not measured yet: `python -m studies.priors measure`") == 6
+    assert pages["prior_trainings.md"].count("Not measured yet: `python -m studies.priors sizes`") == 1
+
+
+def test_tables_keep_their_columns():
+    assert table(["|∇f|", "b"], [["1", "2"]]) == "| \\|∇f\\| | b |\n| --- | --- |\n| 1 | 2 |"
+    assert number(None) == number(float("nan")) == "–" and number(2.0, 1) == "2.0"
 
 
 def rows() -> list[dict]:
