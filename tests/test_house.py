@@ -1,4 +1,4 @@
-"""The structure of the project: what the wheel holds."""
+"""The structure of the project: which module may import which, and what the wheel holds."""
 
 import os
 import shutil
@@ -24,6 +24,19 @@ def _copy(folder: Path, *names: str) -> None:
             shutil.copy(ROOT / name, folder / name)
 
 
+def test_imports_follow_the_floors(tmp_path):
+    """The contracts of `pyproject.toml` hold with `plugins/` where it installs to, and see imports inside functions."""
+    _copy(tmp_path, "sira_mi", "studies", "pyproject.toml")
+    _copy(tmp_path / "sira_mi", "plugins")
+    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    with (tmp_path / "sira_mi" / "plugins" / "sira_sg.py").open("a") as plugin:
+        plugin.write("\n\ndef upwards():\n    from sira_mi.fit import settings\n")
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 1 and "sira_mi.plugins is not allowed to import sira_mi.fit" in result.stdout
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
     """A wheel built from a copy of the sources, so that none of an earlier build gets into it."""
@@ -45,6 +58,7 @@ def test_the_wheel_is_the_product(wheel):
     for file in [*ROOT.glob("sira_mi/portrait/models/*"), ROOT / "sira_mi" / "avatar" / "prior.safetensors"]:
         assert str(file.relative_to(ROOT)) in names
     assert {n.split("/")[0] for n in names} == {"sira_mi", f"sira_mi-{sira_mi.__version__}.dist-info"}
+    assert not [n for n in names if n.startswith("sira_mi/training/collection/data/")]
     assert sum(lines.values()) < 16_000
     assert sum(count for n, count in lines.items() if not n.startswith("sira_mi/training/")) < 11_000
 
