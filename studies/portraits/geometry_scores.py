@@ -49,7 +49,6 @@ from studies.portraits.visible_surface import (
     outer_surface,
 )
 
-ALIGNMENTS = ("h3ds", "landmarks", "camera", "camera_raw")
 REGIONS = ("face", "face_all", "head", "seen", "hidden")
 DIRECTIONS = ("truth_to_prediction", "prediction_to_truth")
 
