@@ -270,6 +270,7 @@ def held_out_of(scene: TrainingScene, model, true_latents, **changes) -> ap.Held
 BASELINE = ap.Baseline(np.array([0.5, 0.5, 0.5]), 0.4)
 
 
+@pytest.mark.slow
 def test_latents_fitted_to_views_of_the_model_explain_them(model, scene, true_latents):
     """Fitted to radiance alone, the latents re-render unseen directions far better than the mean head does."""
     settings = dataclasses.replace(SETTINGS, skin_tone=0.0, white_light=0.0, specular_anchor=0.0, smoothness=0.0)

@@ -335,6 +335,7 @@ def built(collection, tmp_path_factory):
     return folder, settings, sources, benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
 
 
+@pytest.mark.slow
 def test_a_benchmark_holds_photos_and_truth(built):
     """Three portraits with the files and arrays of the contract: the photo is the truth's image in sRGB, it carries its
     focal length, the truth passes the evaluation's own checks, and the head is in the picture."""
@@ -368,6 +369,7 @@ def test_a_benchmark_holds_photos_and_truth(built):
         assert {0, 2, 3} <= set(np.unique(truth.face_region))
 
 
+@pytest.mark.slow
 def test_portraits_that_are_there_are_kept(built, collection, monkeypatch):
     """A second build takes nothing; a portrait whose photo is gone is taken again, to the same bits; other settings
     take all anew."""

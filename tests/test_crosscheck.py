@@ -203,6 +203,7 @@ def test_a_round_head_of_random_networks_and_growth(case):
 TINY = Settings(minutes=0.0, voxel=VOXEL, usual_voxel=0.2, pass_samples=2, side=1, directions=4, speed=False)
 
 
+@pytest.mark.slow
 def test_a_tiny_run_writes_the_page(case, tmp_path):
     measured = measure(case, {SOFT: lobes_of(SOFT)}, TINY, lambda line: None)
     rows = tmp_path / "draft" / "rows.json"

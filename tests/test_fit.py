@@ -47,6 +47,7 @@ def finished(fit, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_output_folder_is_complete_and_consistent(finished):
     """Every file that the README promises is there, at the photo's working resolution, and opens."""
     report = json.loads((finished / "avatar.json").read_text())
@@ -73,6 +74,7 @@ def test_output_folder_is_complete_and_consistent(finished):
     assert avatar.k_s == 1 and avatar.k_r == 1 and "light_refinement" in avatar.tensors
 
 
+@pytest.mark.slow
 def test_scene_file_shows_the_same_picture(finished):
     """`mi.load_file("scene.xml")` renders the sum of `renders/diffuse.exr` and `renders/specular.exr` in the photo's
     camera; with the avatar's refinement of the light, `renders/final.exr`."""
@@ -89,6 +91,7 @@ def test_scene_file_shows_the_same_picture(finished):
     assert np.abs(final - diffuse - specular)[mask].mean() > 1e-4
 
 
+@pytest.mark.slow
 def test_only_what_each_stage_names_is_moved(finished):
     """The reference SDF is never optimised (section 3.2.1), nor is the base albedo network (section 3.2.2)."""
     prior, avatar = load_avatar(), load_avatar(finished / "avatar.safetensors")
@@ -98,6 +101,7 @@ def test_only_what_each_stage_names_is_moved(finished):
         assert not np.array_equal(prior.tensors[name], avatar.tensors[name])
 
 
+@pytest.mark.slow
 def test_killed_fit_resumes_to_the_same_result(fit, finished, tmp_path, monkeypatch):
     """A fit stopped in its geometry and again in its appearance stages ends in the same bits as one that was not."""
     from sira_mi.fit import driver
@@ -124,6 +128,7 @@ def test_killed_fit_resumes_to_the_same_result(fit, finished, tmp_path, monkeypa
         assert np.array_equal(value, twice.tensors[name], equal_nan=True), name
 
 
+@pytest.mark.slow
 def test_interrupt_writes_what_there_is(fit, tmp_path, monkeypatch):
     """Ctrl-C ends cleanly: exit code 130, a whole folder that says it is not complete, and the checkpoint stays."""
     from sira_mi.fit import driver

@@ -212,6 +212,7 @@ def test_portraits_that_cannot_be_fitted_are_refused_in_one_line(case, tmp_path,
     assert len(lines) == 1 and lines[0].startswith("error: ") and words in lines[0]
 
 
+@pytest.mark.slow
 def test_a_fit_at_rates_a_thousand_times_too_high_keeps_its_head(tmp_path, capsys):
     """Of a real photo, in the stage that moves the most: it is said, and head and parameters stay finite."""
     settings = tiny_fit(steps=6)

@@ -98,6 +98,7 @@ def surface_distance(points, vertices, triangles) -> np.ndarray:
     return np.linalg.norm(found - points, axis=1) * MILLIMETRES_PER_UNIT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mean", "moved"])
 def test_registered_surface_lies_on_the_identity(made_up, heads, name):
     """The refined face is on the file's surface in both directions, which the same head with other coefficients is not,
@@ -114,6 +115,7 @@ def test_registered_surface_lies_on_the_identity(made_up, heads, name):
     assert np.median(surface_distance(file_frame(other, expected)[face], expected, triangles)) > 0.5
 
 
+@pytest.mark.slow
 def test_coefficients_move_the_surface_as_the_modes_say(made_up, heads):
     """Motion of face vertices against the modes' displacement at these places; the frame is that between the ears."""
     face = face_mask()
@@ -123,6 +125,7 @@ def test_coefficients_move_the_surface_as_the_modes_say(made_up, heads):
     assert np.linalg.norm(motion - expected) < 0.15 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_shoulders_stay(heads):
     """Identities differ above the shoulders only, up to the origin's shift."""
     low = np.flatnonzero(load_pack().vertices[:BODY_VERTICES, 1] < ict.BODY[1])
@@ -130,6 +133,7 @@ def test_shoulders_stay(heads):
     assert np.ptp(motion, axis=0).max() * MILLIMETRES_PER_UNIT < 0.5
 
 
+@pytest.mark.slow
 def test_eyes_sit_behind_the_lids(made_up, heads):
     """Eyeballs are the file's, and no lid is behind their surface. The warp leaves no perfect balls and bends the lids
     towards them, so that they are scaled down more than those of scans."""
@@ -147,6 +151,7 @@ def test_eyes_sit_behind_the_lids(made_up, heads):
     assert heads["moved"][LEFT_EYE][:, 0].min() > 0
 
 
+@pytest.mark.slow
 def test_head_is_in_the_projects_frame(heads):
     """Origin between the ears, face along +z, and all control vertices finite and within reach of the head."""
     ears = load_pack().masks["ears"] > 0.5
@@ -229,6 +234,7 @@ def test_truncated_file_is_refused(made_up, tmp_path):
         ict_control(path, np.zeros(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coefficients", [np.zeros(4), [0.0, np.nan]])
 def test_unfit_coefficients_are_refused(made_up, heads, coefficients):
     with pytest.raises(InputError, match="up to 3 finite coefficients"):

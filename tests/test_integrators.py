@@ -116,6 +116,7 @@ def interior(alpha: np.ndarray) -> np.ndarray:
     return binary_erosion(alpha > 0.5, iterations=2)
 
 
+@pytest.mark.slow
 def test_radiance_channels(radiance, radiance_image):
     """Alpha marks hits, `closest` is min f along the ray (dense sampling), `mask` its soft step."""
     image, head = radiance_image, head_of(radiance)
@@ -138,12 +139,14 @@ def test_radiance_channels(radiance, radiance_image):
     np.testing.assert_allclose(closest[near], best[near], atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_ray_outside_the_box_is_far(avatar, avatar_path):
     wide = build(avatar_path, avatar, {"type": "sira_radiance", "avatar": avatar_path}, camera(6, SIZE), light=False)
     image = mi.render(wide).numpy()
     assert image[0, 0, 5] == FAR and image[0, 0, 4] < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["head.z_sdf", "head.deformation", "head.reference"])
 def test_colour_derivatives_by_the_shape(radiance, radiance_image, key):
     weight = weights(6) * interior(radiance_image[:, :, 3])[:, :, None]
@@ -151,6 +154,7 @@ def test_colour_derivatives_by_the_shape(radiance, radiance_image, key):
     check(radiance, key, weight, change=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["head.z_sdf", "head.deformation", "head.reference"])
 def test_silhouette_derivatives_by_the_closest_approach(radiance, radiance_image, key):
     weight = np.zeros((SIZE, SIZE, 6), np.float32)
@@ -167,6 +171,7 @@ def test_colour_derivatives_by_the_rendering_function(radiance, key):
     check(radiance, key, weight)
 
 
+@pytest.mark.slow
 def test_other_shapes_occlude(avatar, avatar_path, radiance_image):
     """A screen before the left half of the head; the soft mask is of the head alone."""
     screen = {
@@ -200,6 +205,7 @@ def test_one_head_is_needed(avatar, avatar_path, integrator, heads):
     assert f"exactly one neural_sdf, it holds {heads}" in refusal(scene)
 
 
+@pytest.mark.slow
 def test_a_picture_with_one_ray_on_the_head(avatar, avatar_path, radiance_image):
     """A film of one pixel: tensors of one column."""
     hit = Camera(np.array([[30.0, 0, 0.5], [0, 30, 0.5], [0, 0, 1]]), camera(30).world_to_camera, 1, 1)
@@ -309,6 +315,7 @@ def test_normals_are_world_normals_of_a_turned_head(avatar, avatar_path, shaded_
         np.testing.assert_allclose(image[:, :, channel][inside], expected, atol=2e-3, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "key",
     [
@@ -329,6 +336,7 @@ def test_derivatives_of_the_closed_form(shaded, shaded_image, key):
     check(shaded, key, weight, change=3e-4 if key == "head.z_sdf" else 2e-3)
 
 
+@pytest.mark.slow
 def test_pictures_and_derivatives_repeat_bit_for_bit(avatar, avatar_path):
     def run():
         scene = build(avatar_path, avatar, {"type": "sira_sg", "hide_emitters": True})

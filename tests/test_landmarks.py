@@ -74,6 +74,7 @@ def test_the_correction_turns_and_grows_with_the_photo(face):
     np.testing.assert_allclose(head_landmarks(moved), expected, atol=0.02 * moved.size)
 
 
+@pytest.mark.slow
 def test_errors_that_follow_from_the_direction_are_learned():
     """They are gone on other heads; beyond what was measured the correction stays where it was."""
     known = observations(200, seed=1)

@@ -29,6 +29,7 @@ def observations(noise: float, heads: int = 40, lights: int = 3, misleading: flo
     return found
 
 
+@pytest.mark.slow
 def test_the_fit_finds_the_law_of_the_cues():
     """The white of the eyes, in spite of eyes that mislead; portraits without eyes count for brightness alone. The
     error is that of heads left out: near the noise, and far below what brightness tells."""
@@ -55,6 +56,7 @@ def test_the_true_level_is_that_of_skin_near_the_landmarks():
     assert truth.mask.shape == (SIZE, SIZE)
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_constants_of_the_fit(monkeypatch, capsys, tmp_path):
     """Values and errors by skin alone and with the eyes, or one line that says what is missing."""
     monkeypatch.setattr("sys.argv", ["evaluate", "skin", "--benchmark", str(tmp_path)])

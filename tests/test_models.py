@@ -394,6 +394,7 @@ def test_bad_collections_are_named(tmp_path):
 # Variants
 
 
+@pytest.mark.slow
 def test_plugins_are_there_for_variants_that_are_set_later(avatar_path):
     """Import first, then two variants in turn."""
     code = f"""

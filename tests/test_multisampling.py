@@ -120,6 +120,7 @@ def test_hits_of_the_mesh_are_close_to_those_of_the_field(avatar, avatar_path, s
     assert 0 < np.abs(albedo[0] - albedo[1]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_what_is_differentiated_is_exact(scene):
     """Derivatives with the options are those without."""
     params = mi.traverse(scene)

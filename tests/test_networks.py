@@ -73,6 +73,7 @@ def test_both_modes_and_float64_agree_in_value_and_gradient(avatar, name):
     assert np.abs(tensor[1]).max() > 0
 
 
+@pytest.mark.slow
 def test_appearance_decoders_agree_in_both_modes(avatar):
     networks, t = SMALL.networks, avatar.tensors
     x = points_near_surface(400)
@@ -181,6 +182,7 @@ def test_fused_layers_equal_plain_operations_in_value_and_both_passes(latents):
         np.testing.assert_allclose(fused, plain, atol=2e-5 * np.abs(plain).max())
 
 
+@pytest.mark.slow
 def test_gradients_repeat_bit_for_bit(avatar):
     """With latents, tangents and many points; atomic additions would differ from run to run."""
     x = mi.TensorXf(points_near_surface(20000))

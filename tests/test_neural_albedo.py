@@ -31,6 +31,7 @@ def in_reference_space(avatar, p):
     return deform(SdfField(deformation, [], avatar.architecture.sdf_octaves), mi.TensorXf(np.array(p)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diffuse", "specular"])
 def test_both_modes_agree(avatar, avatar_path, kind):
     albedo, si = texture(avatar_path, kind=kind), interaction()
@@ -46,6 +47,7 @@ def test_both_modes_agree(avatar, avatar_path, kind):
     np.testing.assert_array_equal(np.array(albedo.eval_3(si)), values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "key"), [*(("diffuse", k) for k in DIFFUSE), ("specular", "weights"), ("specular", "latent")]
 )
@@ -84,6 +86,7 @@ def lit(path, bsdf, integrator):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_under_prb(avatar, avatar_path):
     """All of a texture's parameters at once, inside a symbolic loop."""
     albedo = {"type": "neural_albedo", "avatar": avatar_path}
@@ -110,6 +113,7 @@ def test_derivatives_under_prb(avatar, avatar_path):
         assert ad == pytest.approx(difference, rel=1e-2), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "bsdf",
     [
@@ -142,6 +146,7 @@ def test_gradients_enabled_without_an_update_are_refused(avatar_path):
         albedo.eval(interaction())
 
 
+@pytest.mark.slow
 def test_a_refinement_that_is_switched_off_is_not_evaluated(avatar, avatar_path):
     """k_r = 0 gives the base albedo; enabling its gradient brings the refinement back."""
     albedo, si = texture(avatar_path), interaction()
@@ -166,6 +171,7 @@ def test_another_kind_is_refused(avatar_path):
         texture(avatar_path, kind="shiny")
 
 
+@pytest.mark.slow
 def test_textures_of_one_head_are_evaluated_together(avatar_path):
     """`sira_bsdf` asks both albedos of a head at once: the same values and derivatives as one by one. Textures of
     other heads, without a head or baked do not go together."""

@@ -159,6 +159,7 @@ def test_vertices_move_as_the_level_set_does(avatar, scene):
         assert ad == pytest.approx(difference, rel=2e-3), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["direct_projective", "prb_projective"])
 def test_silhouette_derivatives_of_stock_integrators(avatar, avatar_path, integrator):
     """A black head before a white sky: nothing but its outline."""
@@ -168,6 +169,7 @@ def test_silhouette_derivatives_of_stock_integrators(avatar, avatar_path, integr
     check_image_derivatives(avatar, scene, 256, 1e-2, 1e-2, weight)
 
 
+@pytest.mark.slow
 def test_shading_derivatives_under_prb(avatar, avatar_path):
     """The head fills the picture, and the light comes from where it casts no shadow."""
     light = {"type": "point", "position": [1.0, 0.0, 4.0], "intensity": {"type": "rgb", "value": 5.0}}
@@ -176,6 +178,7 @@ def test_shading_derivatives_under_prb(avatar, avatar_path):
     check_image_derivatives(avatar, scene, 16, 2e-3, 5e-3, weight)
 
 
+@pytest.mark.slow
 def test_a_new_extraction_changes_the_picture_as_the_derivative_says(avatar, avatar_path):
     """Differences over two extractions, whose topologies differ; they carry the mesh's own error."""
     scene = build(avatar_path, camera(36), {"type": "direct_projective", "sppi": 0}, bsdf=diffuse(0.0))
@@ -201,6 +204,7 @@ def test_a_new_extraction_changes_the_picture_as_the_derivative_says(avatar, ava
 # Updates
 
 
+@pytest.mark.slow
 def test_sixty_updates_leave_no_memory_behind(avatar, avatar_path):
     """The full 500 are in studies/numerics/remesh_updates.py."""
     scene = build(avatar_path, camera(18), voxel=0.25)
@@ -238,6 +242,7 @@ def test_the_mesh_is_the_same_bits_every_time(avatar_path):
         np.testing.assert_array_equal(np.array(first[key]), np.array(second[key]))
 
 
+@pytest.mark.slow
 def test_a_nested_albedo_follows_the_shape(avatar, avatar_path):
     """A stock BSDF with a neural_albedo: after the latent changes, the texture's reference space is the new one."""
     bsdf = {"type": "principled", "base_color": {"type": "neural_albedo", "avatar": avatar_path}}

@@ -15,6 +15,7 @@ from sira_mi.fit.shaded import seen_points
 from sira_mi.portrait.portrait import Portrait
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sharpness", [30.0, 60.0, 240.0])
 def test_the_derivative_of_the_mask_loss_is_that_of_its_values(variant, avatar, avatar_path, sharpness):
     """A head before its own photo, moved along the line of sight: the integral of AD's derivative is the change of the

@@ -164,6 +164,7 @@ def test_a_plan_is_carried_out_and_switched_off():
     assert plan_table(plan).count("\n") == 4
 
 
+@pytest.mark.slow
 def test_closed_form_pictures_with_and_without_the_plan(blob):
     """Each decision about the closed form alone changes no pixel by more than its bound, and all together neither."""
     light, settings = Light(LOBES), everything("sg")
@@ -200,6 +201,7 @@ def test_shared_shadings_change_pixels_by_less_than_their_bound(blob):
     assert not by_name(plan_relight(near, light, shape, alone, [0.0]))[name].left_out
 
 
+@pytest.mark.slow
 def test_visibility_is_left_out_of_convex_shapes_only(blob, mean_head):
     """Nothing of a convex shape is shadowed and the picture stays as it is; a head shadows itself under light from
     above, and under a flash at the camera it still lights its own hollows."""
@@ -218,6 +220,7 @@ def test_visibility_is_left_out_of_convex_shapes_only(blob, mean_head):
         assert np.abs(first - second).max() > TOLERANCE * white_radiance(light.lobes)
 
 
+@pytest.mark.slow
 def test_late_bounces_add_less_than_their_bound(mean_head):
     """Path tracing to the planned depth against ten more bounces: the bound, where the tolerance is generous, is not
     met by two bounces less."""
@@ -254,6 +257,7 @@ def test_without_a_specular_term_nothing_of_it_is_computed(avatar, tmp_path):
         assert first.max() > 0.1
 
 
+@pytest.mark.slow
 def test_no_ray_beside_the_window_meets_the_head(blob, mean_head):
     """The window holds every pixel that the head covers, is not much larger, and is the whole film for a camera inside
     the head; a picture of the window alone is the same but for its random numbers."""
@@ -291,6 +295,7 @@ def test_an_image_is_planned_by_lobes_of_its_light():
     np.testing.assert_allclose(values[1], values[0], atol=0.06 * values[0].max())
 
 
+@pytest.mark.slow
 def test_what_is_measured_stays_below_its_bound(blob):
     light, settings = Light(LOBES), everything("sg")
     plan = plan_relight(blob, light, load_head(blob, settings), settings, [0.0])
@@ -356,6 +361,7 @@ def test_a_changed_base_albedo_is_computed_again(problem):
     assert np.abs(values[0] - values[1]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_relight_explains_and_keeps_all(avatar_path, tmp_path, monkeypatch, capsys):
     default = RelightSettings.__init__
     monkeypatch.setitem(measure._SAMPLES, "sg", 1)

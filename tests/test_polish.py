@@ -50,6 +50,7 @@ def other(avatar) -> dict[str, np.ndarray]:
     return tensors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVED)
 def test_derivative_is_that_of_the_path_traced_picture(problem, avatar, name):
     """Through vertices, `prb` and networks: the mean of a few steps' derivatives against a central difference of the
@@ -72,6 +73,7 @@ def test_derivative_is_that_of_the_path_traced_picture(problem, avatar, name):
     assert ad == pytest.approx(difference, rel=0.1)
 
 
+@pytest.mark.slow
 def test_polish_finds_albedo_and_light_again(problem, avatar):
     """From another albedo and light, a few steps bring the path-traced picture most of the way to the photo, through
     the driver that runs all stages."""
@@ -117,6 +119,7 @@ def fit(tmp_path_factory):
     return *written, {k.removeprefix("tensor/"): v for k, v in checkpoint.items() if k.startswith("tensor/")}
 
 
+@pytest.mark.slow
 def test_interrupt_in_the_polish_leaves_the_avatar_as_it_was_before(fit):
     """Although the checkpoint holds one that is polished in part."""
     (avatar, report), _, checkpoint = fit
@@ -126,6 +129,7 @@ def test_interrupt_in_the_polish_leaves_the_avatar_as_it_was_before(fit):
         assert not np.array_equal(avatar.tensors[name], checkpoint[name])
 
 
+@pytest.mark.slow
 def test_a_polished_fit_reports_what_it_gained(fit):
     """The pictures come closer to the photo; geometry and base albedo stay; the avatar's lobes are those polished."""
     from sira_mi.fit.shaded import decode_lobes

@@ -90,6 +90,7 @@ def test_several_faces_largest_first(astronaut):
         one_line(error, "--face")
 
 
+@pytest.mark.slow
 def test_close_up_and_no_face(astronaut, face):
     close = np.ascontiguousarray(astronaut[60:190, 165:285])
     found = find_faces(cv2.resize(close, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC))
@@ -210,6 +211,7 @@ def test_half_a_portrait_shows_the_same():
     assert np.allclose(half.landmarks, camera.project(points) * [3 / 6, 3 / 7])
 
 
+@pytest.mark.slow
 def test_portrait_of_the_test_photo(photo_file, head, astronaut, mask):
     portrait = make_portrait(photo_file, SETTINGS, head)
     np.testing.assert_allclose(portrait.image, srgb_to_linear(astronaut / 255.0), atol=1e-6)
@@ -252,6 +254,7 @@ def test_given_camera_is_made_square_and_follows_the_image(tmp_path, photo_file,
     assert not any("away from the face" in note for note in portrait.notes)
 
 
+@pytest.mark.slow
 def test_no_face_needs_both_mask_and_camera(tmp_path, head):
     coffee = skimage.data.coffee()[:300, :400]
     photo, mask_path, camera_path = (tmp_path / name for name in ("coffee.png", "mask.png", "camera.json"))
@@ -285,6 +288,7 @@ def test_photo_alpha_becomes_the_mask(tmp_path, astronaut, head):
     assert any("alpha" in note for note in portrait.notes)
 
 
+@pytest.mark.slow
 def test_exif_rotated_cmyk_and_dark_exr_photos_give_the_same_face(tmp_path, astronaut, head, face):
     exif = Image.Exif()
     exif[ORIENTATION] = 6

@@ -75,6 +75,7 @@ def jobs(photo, tmp_path_factory):
     return [(job, run(job)) for job in (geometry, shaded)]
 
 
+@pytest.mark.slow
 def test_a_fit_leaves_what_it_is_scored_by(jobs):
     """At the photo's size, whatever the working image's; the appearance goes on from the geometry's very tensors."""
     for job, result in jobs:
@@ -93,6 +94,7 @@ def test_a_fit_leaves_what_it_is_scored_by(jobs):
     assert np.abs(before["pose"]).max() > 0
 
 
+@pytest.mark.slow
 def test_a_fit_is_done_once_and_again_when_what_it_depends_on_changes(jobs, monkeypatch):
     started = []
 

@@ -111,6 +111,7 @@ def test_baked_albedos_have_no_gradients_and_no_place_outside_of_a_head(avatar_p
         texture.eval(dr.zeros(mi.SurfaceInteraction3f, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, kind", [("sg", "lobes"), ("path", "lobes"), ("path", "image")])
 def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
     """`load_scene` moves camera and light; `to_world` of the shape turns the head itself."""

@@ -31,6 +31,7 @@ def one_light(tmp_path):
     return str(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["sira_sg", "sira_radiance", "path", "prb", "direct"])
 @pytest.mark.parametrize("name", ["fit.xml", "relight.xml"])
 def test_every_integrator_renders_the_scene(name, integrator, avatar_path, one_light):
@@ -65,6 +66,7 @@ def test_scale_is_that_of_the_light(avatar_path, one_light):
     np.testing.assert_allclose(3 * images[0][..., :3], images[1][..., :3], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_environment_map_is_taken_as_it_is_or_fitted(avatar_path):
     exact = load("relight.xml", avatar=avatar_path, environment="envmap", hide_emitters=False)
     fitted = load("relight.xml", avatar=avatar_path, hide_emitters=False)
@@ -98,6 +100,7 @@ def test_the_default_lights_are_there():
     assert (SCENES / "lights" / "studio.exr").stat().st_size < 200_000
 
 
+@pytest.mark.slow
 def test_avatars_are_found_beside_the_scene_and_in_the_current_folder(avatar, avatar_path, tmp_path, monkeypatch):
     folder = tmp_path / "Zoë's fit ü"
     folder.mkdir()

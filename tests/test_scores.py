@@ -103,6 +103,7 @@ def test_samples_are_even_by_area():
     np.testing.assert_allclose(flat[:, 2], 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("winding", [1, -1])
 def test_only_what_can_be_seen_from_outside_is_surface(winding):
     """A head within a head and a plate inside both are left out, whichever way the triangles turn."""
@@ -206,6 +207,7 @@ def ball_truth() -> Truth:
     return truth_of(np.array(ball.vertices), np.array(ball.faces), camera=turned_camera(0))
 
 
+@pytest.mark.slow
 def test_larger_ball_is_as_far_as_its_radius_says():
     """Balls of 100 and 105 mm about one centre are 5 mm apart everywhere, in both directions; after alignment they are
     the same."""
@@ -250,6 +252,7 @@ def with_hair() -> Truth:
     return truth_of(both, np.concatenate([faces, cap + len(vertices)]), region, landmarks_on(vertices))
 
 
+@pytest.mark.slow
 def test_hair_counts_for_the_head_and_not_for_the_face():
     """A bald prediction, exact where there is skin. Its scalp still counts along the hair's rim, where true skin is
     nearer to it than hair."""
@@ -268,6 +271,7 @@ def test_hair_counts_for_the_head_and_not_for_the_face():
     assert surface.outer.points[under, 1].max() < 0.8  # no scalp but what shows under the hair's rim
 
 
+@pytest.mark.slow
 def test_a_bubble_inside_the_prediction_is_no_help(truth, surface):
     """A prediction that is 5 mm too large all over scores the same when it has the true surface inside itself."""
     large = 1.05 * truth.vertices

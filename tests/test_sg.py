@@ -193,6 +193,7 @@ def specular_form(function, view, roughness, albedo, sharpness, axes):
     return value.x.numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.2, 0.45, 0.7])
 def test_specular_closed_form_against_quadrature(roughness):
     """Largest error over light directions, relative to the largest value: within 2.5% to 70° and 6% to 85°, half of
@@ -218,6 +219,7 @@ def test_specular_closed_form_against_quadrature(roughness):
         print(f"  view {degrees:2d}°  " + "   ".join(cells))
 
 
+@pytest.mark.slow
 def test_constant_light_is_reflected_by_the_exact_energy():
     """The directional albedo, for sharpness 0: within 1% at every roughness of the tables; in float32, and continuous
     to very broad lights."""
@@ -233,6 +235,7 @@ def test_constant_light_is_reflected_by_the_exact_energy():
                     assert value == pytest.approx(exact, rel=0.01), (roughness, degrees, albedo)
 
 
+@pytest.mark.slow
 def test_shade_equals_its_reference():
     """The custom operation with fixed sums against Dr.Jit's differentiation of a plain loop."""
     *point, set_of_lobes = shading_inputs()
@@ -309,6 +312,7 @@ def test_forward_mode_agrees_with_reverse_mode():
     assert (gradients(*point, set_of_lobes)[3] * tangent).sum() == pytest.approx(forward, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_repeat_bit_for_bit():
     """Several thousand points: enough for several threads."""
     *point, set_of_lobes = shading_inputs(points=5000, count=16)
@@ -341,6 +345,7 @@ def test_shade_inside_a_symbolic_loop():
     np.testing.assert_allclose(dr.grad(packed).numpy(), reference, rtol=1e-3, atol=1e-4 * np.abs(reference).max())
 
 
+@pytest.mark.slow
 def test_extreme_inputs_give_finite_values_and_gradients():
     """Sharpness from 0 to 1e7, lights behind, views grazing, below and along the normal, every roughness."""
     normal, view = random_points(40, 2)

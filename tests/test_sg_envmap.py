@@ -131,6 +131,7 @@ def ball(light, integrator):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["prb", "path"])
 def test_gradients_of_lobes_match_differences(integrator):
     """AD against central differences along a direction in all 21 numbers, and in the scale, within 1e-2."""

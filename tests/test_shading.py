@@ -46,6 +46,7 @@ def tensors_of(avatar) -> dict:
     return initial_tensors(avatar, 0) | own
 
 
+@pytest.mark.slow
 def test_the_colour_is_that_of_eq_8(problem):
     """Of the photo's own head it vanishes, whatever the pose was: the camera has taken it up."""
     tensors = tensors_of(problem.avatar) | {"pose": np.full(6, 0.3, np.float32)}
@@ -57,6 +58,7 @@ def test_the_colour_is_that_of_eq_8(problem):
     assert float(problem.losses({}, STAGE, 0, np.random.default_rng(0))["color"].numpy().item()) > 1e-2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STAGE.rates)
 def test_the_derivative_of_the_colour_is_a_difference(problem, name):
     """Of every tensor that the stage moves; off the photo's own head, where the loss has a kink."""

@@ -267,6 +267,7 @@ APPEARANCE_MEASURES = measure_appearance.AppearanceMeasures(imaged=1, pictured=1
 PROTOCOL = short_trainings.Protocol(scans=1, points=100, heads=1, cost_points=256, fit=FIT, color_steps=5)
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_path, monkeypatch):
     collection, runs = balls
     monkeypatch.setattr(measure_shape, "Measures", lambda: MEASURES)

@@ -126,6 +126,7 @@ def model_albedo(angle, roughness, diffuse, specular):
     return (value * light[..., 2] * (0.5 * weights[:, None] * 2 * np.pi / 1024)).sum()
 
 
+@pytest.mark.slow
 def test_white_furnace_is_the_models_own():
     """Sampled albedo never exceeds the model's by more than noise; the model's own excess is printed."""
     print("\nwhite furnace, largest albedo over view angles")
@@ -144,6 +145,7 @@ def test_white_furnace_is_the_models_own():
             print(f"  a={diffuse} s={specular} r={roughness}: sampled {largest[0]:.4f}, model {largest[1]:.4f}")
 
 
+@pytest.mark.slow
 def test_closed_form_agrees_with_monte_carlo():
     """`shade` against this plugin under `sg_envmap` with the same lobes, by view angle; the errors are printed."""
     generator = np.random.default_rng(4)
@@ -193,6 +195,7 @@ def test_gradients_match_differences(key):
     assert derivative == pytest.approx((values[0] - values[1]) / 4e-3, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["path", "prb"])
 def test_renders_two_sided_with_textures_and_gradients(integrator):
     """Nested in `twosided`, with bitmap textures, under a stock integrator: light arrives, gradients are finite."""

@@ -95,6 +95,7 @@ def test_an_eye_that_misleads_hardly_counts(variant):
     assert abs(level(lit, lit) - usual) > abs(level(lit) - usual)
 
 
+@pytest.mark.slow
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     """The loss is lowest where the albedo at the landmarks has the expected luminance."""
     from sira_mi.fit.shaded import base_albedo, photo_points
@@ -117,6 +118,7 @@ def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     assert skin_patches(off, points) is None
 
 
+@pytest.mark.slow
 def test_geometry_does_not_depend_on_the_exposure(variant, portrait):
     """A photo a quarter as bright has the same losses: the learned radiance starts a quarter as bright, and both are
     compared at the exposure of the training. An untrained rendering function is left alone."""

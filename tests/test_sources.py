@@ -55,6 +55,7 @@ def millimetres(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return 100 * np.linalg.norm(a - b, axis=1)
 
 
+@pytest.mark.slow
 def test_automatic_landmarks_against_known_correspondence():
     """Two heads of the pack: the marks of the network lie where the topology carries the landmarks, within the
     network's own accuracy (2.2 mm over many heads); turning and moving the head by its landmarks is better."""
@@ -147,6 +148,7 @@ def write_file(path, parts, to_file):
     mesh.export(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ending", "scale", "turn", "shift"),
     [
@@ -203,6 +205,7 @@ def test_textures_are_read_the_right_way_up(tmp_path):
             assert np.abs(stored.astype(int) - expected).max() <= 2, f"{ending}: corner {x}, {y}"
 
 
+@pytest.mark.slow
 def test_broken_meshes_are_refused_with_the_reason(tmp_path, monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=3)
 
@@ -291,6 +294,7 @@ def avatar_folder(person, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_avatar_in_metres_keeps_its_size_and_gets_regions(person, avatar_folder):
     """A head of the pack written as a VALID avatar: landmarks within the network's accuracy of the known ones after the
     rigid motion that known landmarks would give, closed body down to the floor, skin, eyes, hair and group."""
@@ -323,6 +327,7 @@ def test_avatar_names_give_groups():
     assert group_of("somebody") == {"ancestry": "unknown", "sex": "unknown", "age": "adult"}
 
 
+@pytest.mark.slow
 def test_broken_avatars_are_refused_with_the_reason(person, tmp_path, monkeypatch):
     arrays = write_avatar(tmp_path, person)
 

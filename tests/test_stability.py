@@ -23,6 +23,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 MEASURES = [measure for measures in NUMERICS.values() for measure in measures]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", MEASURES, ids=[f"{m.__module__.split('.')[-1]}-{m.__name__}" for m in MEASURES])
 def test_row(measure):
     row = measure(True)

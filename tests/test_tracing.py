@@ -114,6 +114,7 @@ def test_chunks_come_in_few_sizes_and_fill_columns_change_nothing(avatar):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_closest_approach_finds_the_smallest_distance_along_a_ray(avatar):
     field = head_field(avatar)
     evaluate = lambda x: columns.evaluate_in_chunks(lambda p: sdf.signed_distance(field, p), x)[0][0]  # noqa: E731

@@ -107,6 +107,7 @@ def test_even_directions_keep_the_energy_of_lobes_that_they_do_not_resolve():
     np.testing.assert_allclose(found, lobes[0, 4:] * 2 * np.pi / 3000, rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lobes, kind, count, tolerance",
     [
@@ -243,6 +244,7 @@ def shadowed(avatar_path):
     return {name: picture[mask][:, :3] for name, picture in pictures.items()}
 
 
+@pytest.mark.slow
 def test_shadows_agree_with_path_tracing(shadowed):
     """With visibility the closed form is within 5% of path tracing where it is off by over 25% without."""
     mean = shadowed["path"].mean()
