@@ -100,7 +100,7 @@ class SiraSG(mi.SamplingIntegrator):
         super().__init__(props)
         self.hide_environment = bool(props.get("hide_emitters", False))
         self.visibility = bool(props.get("visibility", True))
-        self.directions = int(props.get("visibility_directions", 64))
+        self.directions = int(props.get("visibility_directions", visibility.DEFAULT_DIRECTIONS))
         if not 16 <= self.directions <= 4096:
             raise InputError(f"sira_sg: visibility_directions is {self.directions}; it must be 16 to 4096")
         self.aovs = bool(props.get("aovs", True))

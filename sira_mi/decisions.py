@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Decision:
     reason: str  # the condition, and what was found
     bound: float = 0.0  # of the error
     built_in: bool = False  # always left out; nothing switches it off
-    changes: Mapping[str, object] = field(default_factory=dict)  # the settings that carry it out
+    changes: Mapping[str, Any] = field(default_factory=dict)  # the settings that carry it out
     error: float | None = None  # measured: root mean square over the head's pixels, or largest over the gradient
     noise: float | None = None  # of the measured error: the difference between two seeds of one picture
     saved: float | None = None  # measured share of the time that is saved
@@ -53,7 +54,7 @@ class Plan:
 
     def apply(self, settings):
         """`settings`, a frozen dataclass, with the changes of everything that is left out."""
-        changes: dict[str, object] = {}
+        changes: dict[str, Any] = {}
         for decision in self.decisions:
             if decision.left_out:
                 changes |= decision.changes

@@ -5,7 +5,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.camera import Camera, yaw_rotation
 
 # OpenCV's camera looks along +z with x right and y down; Mitsuba's looks along +z with x left and y up.
 _OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -65,7 +65,6 @@ def head(avatar: str | Path, voxel: float = 0.05, **options) -> dict:
 
 def orbit(camera: Camera, yaw_degrees: float) -> Camera:
     """The camera moved about the world's y axis so that the head appears turned by `yaw_degrees` to its left."""
-    angle = np.radians(yaw_degrees)
     turn = np.eye(4)
-    turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    turn[:3, :3] = yaw_rotation(yaw_degrees)
     return Camera(camera.K, camera.world_to_camera @ turn, camera.width, camera.height)

@@ -214,6 +214,12 @@ def _initial_pose(
     return cv2.Rodrigues(frontal)[0].ravel(), np.array([*offset, _MEDIAN_DISTANCE])
 
 
+def yaw_rotation(degrees: float) -> np.ndarray:
+    """Rotation [3, 3] about the world's y axis; a positive one turns a face along +z towards +x."""
+    angle = np.radians(degrees)
+    return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+
+
 def _matrix(data: dict, key: str, side: int, source: str) -> np.ndarray:
     try:
         matrix = np.array(data[key], np.float64)

@@ -1,20 +1,28 @@
 """`python -m sira_mi.relight AVATAR --lights FILE --out IMAGE`: a fitted head under another light."""
 
+from __future__ import annotations
+
 import argparse
 import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sira_mi.errors import CommandParser, InputError, run_command
+
+if TYPE_CHECKING:
+    from sira_mi.plugins.neural_sdf import NeuralSDF
+    from sira_mi.relight.render import RelightSettings
+    from sira_mi.relight.subject import Light, Subject
 
 _DESCRIPTION = """\
 Renders a fitted head under another light, and writes IMAGE.exr (linear radiance) and IMAGE.png (sRGB).
 
-The head turns under a light that stays fixed to the world, as does the camera. Two integrators:
-  path  path tracing: shadows and interreflections, and noise that falls with --spp; an .exr is the light itself
-  sg    closed form (eq. 8 of SIRA): no noise and quick, shadows and one bounce approximated; spherical Gaussians are
-        fitted to an .exr"""
+The head turns; the light and the camera stay fixed. Two integrators:
+  path  path tracing: shadows and all interreflections, with noise that falls with --spp; uses an .exr as it is
+  sg    closed form (eq. 8 of SIRA): quick and without noise, with approximate shadows and one bounce; fits spherical
+        Gaussians to an .exr"""
 _EPILOG = """\
 examples:
   python -m sira_mi.relight avatar --lights scenes/lights/studio.exr --out relit.png
@@ -62,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
         "--compare", action="store_true", help="render with both integrators under the same lobes; print the difference"
     )
     parser.add_argument(
-        "--explain", action="store_true", help="say what is left out, and measure each on a small picture"
+        "--explain", action="store_true", help="say what is left out, and measure the error of each on a small picture"
     )
     parser.add_argument("--keep-all", action="store_true", help="leave nothing out; with path that is --exact, too")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant, e.g. cuda_ad_rgb")
@@ -108,9 +116,11 @@ def output_stem(out: Path) -> Path:
     return stem
 
 
-def _plan_pictures(subject, light, settings, yaws: list[float], options: argparse.Namespace) -> tuple:
-    """The settings of the pictures at `yaws`, and the head for them, as `--keep-all` and the plan say; `--explain`
-    prints the plan."""
+def _plan_pictures(
+    subject: Subject, light: Light, settings: RelightSettings, yaws: list[float], options: argparse.Namespace
+) -> tuple[RelightSettings, NeuralSDF]:
+    """The settings of the pictures at `yaws`, degrees, and their head: what does not matter is left out, unless
+    `--keep-all`. `--explain` prints the decisions."""
     from sira_mi.decisions import explain
     from sira_mi.relight.leave_out import plan_relight
     from sira_mi.relight.measure import measure_plan
@@ -124,8 +134,9 @@ def _plan_pictures(subject, light, settings, yaws: list[float], options: argpars
     if options.explain:
         print(explain(measure_plan(plan, subject, light, everything, yaws[0])), flush=True)
     chosen = (plan.keep_all() if options.keep_all else plan).apply(everything)
-    reloaded = (chosen.exact, chosen.specular) != (settings.exact, settings.specular)
-    return chosen, load_head(subject, chosen) if reloaded else shape
+    if (chosen.exact, chosen.specular) != (settings.exact, settings.specular):
+        shape = load_head(subject, chosen)
+    return chosen, shape
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -150,6 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
         background=options.background,
         shared=options.draft,
         on_mesh=options.draft,
+        extra_channels=options.compare,
     )
     subject = read_subject(options.avatar, options.size)
     light = read_light(options.lights, subject.avatar, lobes=options.compare or options.integrator == "sg")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
-import mitsuba as mi
 import numpy as np
 
 from sira_mi.portrait.camera import Camera
@@ -14,6 +14,9 @@ from sira_mi.relight.pictures import psnr_inside
 from sira_mi.relight.render import RelightSettings, load_scene, render_passes
 from sira_mi.relight.subject import Light
 from sira_mi.sg.layers import split_layers
+
+if TYPE_CHECKING:
+    from sira_mi.plugins.neural_sdf import NeuralSDF
 
 # Samples a pixel of the closed form, which only its outlines need.
 CLOSED_FORM_SAMPLES = 8
@@ -34,7 +37,7 @@ class Comparison:
 
 
 def compare(
-    shape: mi.Shape,
+    shape: NeuralSDF,
     camera: Camera,
     light: Light,
     yaw_degrees: float,

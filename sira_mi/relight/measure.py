@@ -1,4 +1,4 @@
-"""What the decisions of a plan really cost and save: each alone, on a small picture or on some steps of a fit."""
+"""The measured error and saving of what a picture leaves out: each decision alone, on a small picture."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sira_mi.decisions import Decision, Plan
-from sira_mi.relight.leave_out import image_lobes
+from sira_mi.relight.leave_out import approximate_lobes
 from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes
 from sira_mi.relight.subject import Light, Subject
 from sira_mi.sg.weak_lobes import white_radiance
 
+if TYPE_CHECKING:
+    from sira_mi.plugins.neural_sdf import NeuralSDF
+
 _SIZE = 64
 _SAMPLES = {"path": 64, "sg": 4}
-# Networks inside of path tracing are slow.
+# Networks inside path tracing are slow.
 _EXACT_SIZE, _EXACT_SAMPLES = 64, 4
 _REPEATS = 3
 
@@ -25,71 +29,71 @@ _REPEATS = 3
 def measure_plan(
     plan: Plan, subject: Subject, light: Light, settings: RelightSettings, yaw: float, size: int = _SIZE
 ) -> Plan:
-    """The plan with the error, its noise and the time saved of all that it leaves out, on a picture whose longer side
-    has `size` pixels; `settings` are those that leave nothing out."""
+    """The plan with the error, its noise and the time saved of everything that is left out, in a picture whose longer
+    side has `size` pixels; `settings` leave nothing out."""
+    white = max(white_radiance(approximate_lobes(light)), 1e-30)
 
     @cache
-    def head(exact: bool, specular: bool):
+    def head(exact: bool, specular: bool) -> NeuralSDF:
         return load_head(subject, replace(settings, exact=exact, specular=specular))
 
-    decisions = tuple(
-        _measure_decision(d, head, subject, light, settings, yaw, size) if d.left_out and d.changes else d
-        for d in plan.decisions
-    )
-    return Plan(decisions)
+    def measure(decision: Decision) -> Decision:
+        exact = "exact" in decision.changes
+        samples = _EXACT_SAMPLES if exact else _SAMPLES[settings.integrator]
+        small = subject.resize(_EXACT_SIZE if exact else size)
+        keeping = replace(settings, samples=samples, exact=exact)
+        leaving_out = replace(keeping, **decision.changes)
+
+        def renderer(one: RelightSettings) -> Callable[[int], np.ndarray]:
+            scene = load_scene(head(one.exact, one.specular), small.camera, light, yaw, one)
+            return lambda seed: render_passes(scene, replace(one, seed=seed))[..., :3]
+
+        if exact:
+            # One after the other: the kernels of every head hold the networks of all heads that are alive.
+            reference, other, seconds = _render_alone(renderer(keeping), head.cache_clear)
+            picture, _, less = _render_alone(renderer(leaving_out), head.cache_clear)
+            saved, spread = 1 - less / max(seconds, 1e-9), 0.0
+        else:
+            full, part = renderer(keeping), renderer(leaving_out)
+            reference, picture, other = full(0), part(0), full(1)
+            saved, spread = measure_saving(lambda: full(0), lambda: part(0))
+        covered = reference.max(axis=2) > 0
+        error, noise = (
+            float(np.sqrt(((image - reference)[covered] ** 2).mean())) / white if covered.any() else 0.0
+            for image in (picture, other)
+        )
+        # Closed forms of the same film have the same random numbers: they differ by the decision alone.
+        if settings.integrator == "sg" and "crop" not in decision.changes:
+            noise = 0.0
+        return replace(decision, error=error, noise=noise, saved=saved, saved_spread=spread)
+
+    return Plan(tuple(measure(d) if d.left_out and d.changes else d for d in plan.decisions))
 
 
-def _measure_decision(decision: Decision, head, subject, light, settings: RelightSettings, yaw, size) -> Decision:
-    exact = "exact" in decision.changes
-    samples = _EXACT_SAMPLES if exact else _SAMPLES[settings.integrator]
-    subject = subject.resize(_EXACT_SIZE if exact else size)
-    kept = replace(settings, samples=samples, exact=exact)
-    left_out = replace(kept, **decision.changes)
-
-    def pictures(one: RelightSettings) -> Callable[..., np.ndarray]:
-        scene = load_scene(head(one.exact, one.specular), subject.camera, light, yaw, one)
-        return lambda seed=0: render_passes(scene, replace(one, seed=seed))[..., :3]
-
-    if exact:
-        # One after the other: the kernels of every head hold the networks of all that are alive.
-        reference, other, seconds = _measure_alone(pictures(kept), head)
-        picture, _, less = _measure_alone(pictures(left_out), head)
-        saved, spread = 1 - less / max(seconds, 1e-9), 0.0
-    else:
-        full, part = pictures(kept), pictures(left_out)
-        reference, picture, other = full(), part(), full(seed=1)
-        saved, spread = measure_saving(full, part)
-    lobes = image_lobes(light.image) if light.lobes is None else light.lobes
-    white = max(white_radiance(lobes), 1e-30)
-    covered = reference.max(axis=2) > 0
-    error, noise = (
-        float(np.sqrt(((image - reference)[covered] ** 2).mean())) / white if covered.any() else 0.0
-        for image in (picture, other)
-    )
-    # Where the random numbers are the same, nothing but the decision differs.
-    same_numbers = not ({"crop"} & decision.changes.keys()) and settings.integrator == "sg"
-    return replace(decision, error=error, noise=0.0 if same_numbers else noise, saved=saved, saved_spread=spread)
-
-
-def _measure_alone(picture: Callable[..., np.ndarray], head) -> tuple[np.ndarray, np.ndarray, float]:
-    """A picture by two seeds, and the processor's time of one, the median of some after those; forgets all heads."""
-    images, seconds = [picture(seed=seed) for seed in range(2)], []
+def _render_alone(
+    render: Callable[[int], np.ndarray], forget_heads: Callable[[], None]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """A picture by two seeds, and the median processor time of some more, s."""
+    first, second = render(0), render(1)
+    seconds = []
     for _ in range(_REPEATS):
         start = time.process_time()
-        picture()
+        render(0)
         seconds.append(time.process_time() - start)
-    del picture
-    head.cache_clear()
-    return *images, float(np.median(seconds))
+    del render
+    forget_heads()
+    return first, second, float(np.median(seconds))
 
 
-def measure_saving(kept: Callable[[], object], left_out: Callable[[], object], repeats: int = _REPEATS) -> tuple:
-    """Share of the processor's time that `left_out` takes less than `kept`: the median over pairs of runs in turn,
-    after a first pair that does not count; and half the range over the pairs."""
+def measure_saving(
+    keep: Callable[[], object], leave_out: Callable[[], object], repeats: int = _REPEATS
+) -> tuple[float, float]:
+    """The share of processor time that `leave_out` saves of `keep`: the median over pairs of runs in turn, after a
+    first pair that does not count; and half the range over the pairs."""
     shares = []
     for _ in range(repeats + 1):
         seconds = []
-        for run in (kept, left_out):
+        for run in (keep, leave_out):
             start = time.process_time()
             run()
             seconds.append(time.process_time() - start)

@@ -1,10 +1,11 @@
-"""Renders of a turned head under a fixed light, by the closed form or by path tracing, in bounded memory."""
+"""Renders a turned head under a fixed light, in closed form or by path tracing, in bounded memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import mitsuba as mi
 import numpy as np
@@ -13,11 +14,14 @@ from sira_mi.errors import InputError
 from sira_mi.export.scene import head, orbit, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_exr, write_png
-from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.camera import Camera, yaw_rotation
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.subject import Light, Subject
 
-# Integrators by the name that the command knows them by.
+if TYPE_CHECKING:
+    from sira_mi.plugins.neural_sdf import NeuralSDF
+
+# Mitsuba's plugin for each name of the command line.
 INTEGRATORS = {"sg": "sira_sg", "path": "path"}
 # Rays of one pass; a pass has at least one sample a pixel.
 _PASS_RAYS = 1 << 20
@@ -38,7 +42,7 @@ class RelightSettings:
     visibility: bool = True  # sg: shadows and one bounce
     shared: bool = False  # sg: samples of a pixel that see almost the same place share one shading
     on_mesh: bool = False  # sg: hits, normals and albedos of the mesh instead of the field's
-    extra_channels: bool = True  # sg: those that `sira_sg` gives beside the radiance
+    extra_channels: bool = True  # sg: the channels of `sira_sg` besides the radiance
     kept_lobes: tuple[int, ...] | None = None  # numbers of the lobes that light the head; None for all
     crop: bool = False  # trace only the rectangle of the film that the head is in
 
@@ -48,7 +52,7 @@ class RelightSettings:
         return [min(most, self.samples - start) for start in range(0, self.samples, most)]
 
 
-def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
+def load_head(subject: Subject, settings: RelightSettings) -> NeuralSDF:
     """The subject's head as a Mitsuba shape; one serves any number of scenes.
 
     Raises InputError when the avatar's field has no surface."""
@@ -62,7 +66,7 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
     if settings.integrator == "path" and not settings.specular:
         description["bsdf"] = {"type": "diffuse", "reflectance": bsdf["diffuse_albedo"]}
     try:
-        return mi.load_dict(description)
+        return cast("NeuralSDF", mi.load_dict(description))
     except RuntimeError as error:  # Mitsuba's, with the plugin's own as its text
         if EmptySurfaceError.__name__ not in str(error):
             raise
@@ -70,13 +74,14 @@ def load_head(subject: Subject, settings: RelightSettings) -> mi.Shape:
 
 
 def load_scene(
-    shape: mi.Shape, camera: Camera, light: Light, yaw_degrees: float, settings: RelightSettings
+    shape: NeuralSDF, camera: Camera, light: Light, yaw_degrees: float, settings: RelightSettings
 ) -> mi.Scene:
-    """The head turned by `yaw_degrees` to its left about the world's y axis, before a fixed camera, under a fixed
-    light. Camera and light are moved about the head instead, which gives the same picture of the same mesh."""
-    angle = np.radians(-yaw_degrees)
-    back = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    integrator = {"type": INTEGRATORS[settings.integrator], "hide_emitters": not settings.background}
+    """The head turned by `yaw_degrees` to its left about the world's y axis, before a fixed camera and under a fixed
+    light. Camera and light are turned about the head instead, which gives the same picture with the same mesh."""
+    integrator: dict[str, object] = {
+        "type": INTEGRATORS[settings.integrator],
+        "hide_emitters": not settings.background,
+    }
     if settings.integrator == "path":
         integrator["max_depth"] = settings.max_depth
         light = light.select(settings.kept_lobes)
@@ -90,19 +95,19 @@ def load_scene(
         if settings.kept_lobes is not None:
             integrator["shaded_lobes"] = mi.TensorXf(np.array(settings.kept_lobes, np.float32))
     view = orbit(camera, yaw_degrees)
-    # Closed forms are smooth: samples that are spread evenly serve their outlines best.
+    # Closed forms are smooth; evenly spread samples are best for their outlines.
     eye = sensor(view, {"type": "independent" if settings.integrator == "path" else "multijitter"})
     if settings.crop:
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         eye["film"] |= dict(zip(names, head_window(shape, view), strict=True))
-    return mi.load_dict(
-        {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": light.emitter(back)}
-    )
+    emitter = light.emitter(yaw_rotation(-yaw_degrees))
+    scene = {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": emitter}
+    return cast(mi.Scene, mi.load_dict(scene))
 
 
-def head_window(shape: mi.Shape, camera: Camera) -> tuple[int, int, int, int]:
+def head_window(shape: NeuralSDF, camera: Camera) -> tuple[int, int, int, int]:
     """The rectangle (x, y, width, height) of the film, in pixels, outside of which no ray meets the mesh of a
-    `neural_sdf`: all of it where a vertex lies beside or behind the camera."""
+    `neural_sdf`. It is the whole film if a vertex lies beside or behind the camera."""
     vertices = shape.vertices()
     place = camera.K @ (camera.world_to_camera[:3, :3] @ vertices + camera.world_to_camera[:3, 3:])
     if place[2].min() <= 1e-3:
@@ -117,14 +122,13 @@ def head_window(shape: mi.Shape, camera: Camera) -> tuple[int, int, int, int]:
 def render_passes(
     scene: mi.Scene, settings: RelightSettings, done: Callable[[int], object] | None = None
 ) -> np.ndarray:
-    """The film's channels [H, W, channels] (float32), averaged over passes that bound the memory; 0 outside the part
-    of the film that is traced. After each pass `done` is called with its samples a pixel. The same seed gives the same
-    picture."""
+    """The film's channels [H, W, channels] (float32), averaged over passes that bound the memory; 0 outside the crop
+    window. After each pass `done` is called with its samples a pixel. The same seed gives the same picture."""
     film = scene.sensors()[0].film()
     (width, height), (x, y) = film.crop_size(), film.crop_offset()
-    total = 0.0
+    total: np.ndarray = np.zeros((1, 1, 1))
     for k, samples in enumerate(settings.pass_samples(int(width), int(height))):
-        seed = int(np.random.SeedSequence([settings.seed, k]).generate_state(1)[0])
+        seed = mi.UInt32(int(np.random.SeedSequence([settings.seed, k]).generate_state(1)[0]))
         total = total + samples * mi.render(scene, spp=samples, seed=seed).numpy().astype(np.float64)
         if done is not None:
             done(samples)

@@ -1,4 +1,4 @@
-"""What is relit: an avatar, the camera that it was photographed by, and a light from a file."""
+"""The input of relighting: an avatar, the camera of its photo, and a light."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sira_mi.portrait.camera import Camera
 from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
 from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
 
-# Head and shoulders from the front, 1.2 m away: the camera where none is known.
+# Head and shoulders from the front, 1.2 m away: the camera of an avatar without a report.
 PORTRAIT_CAMERA = Camera(
     K=np.array([[1317.0, 0.0, 256.0], [0.0, 1317.0, 256.0], [0.0, 0.0, 1.0]]),
     world_to_camera=np.array([[1.0, 0, 0, 0], [0, -1, 0, -0.4], [0, 0, -1, 12], [0, 0, 0, 1]]),
@@ -45,15 +45,15 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """An environment: `lobes` [N_l, 7], or an `image` [H, W, 3] of linear radiance, or both, the lobes fitted to the
-    image."""
+    """An environment: `lobes` [N_l, 7], an `image` [H, W, 3] of linear radiance, or an image and the lobes fitted to
+    it."""
 
     lobes: np.ndarray | None
     image: np.ndarray | None = None
 
     def select(self, numbers: tuple[int, ...] | None) -> Light:
-        """The light of some of the lobes; None for all."""
-        return self if numbers is None else Light(self.lobes[list(numbers)], self.image)
+        """The light of the lobes with these numbers; None for all."""
+        return self if numbers is None or self.lobes is None else Light(self.lobes[list(numbers)], self.image)
 
     def emitter(self, rotation: np.ndarray) -> dict:
         """The emitter for `mi.load_dict`, turned by `rotation` [3, 3]: `envmap` of the image if there is one, else
@@ -61,7 +61,10 @@ class Light:
         if self.image is not None:
             to_world = np.eye(4)
             to_world[:3, :3] = rotation
-            return {"type": "envmap", "bitmap": mi.Bitmap(self.image), "to_world": mi.ScalarTransform4f(to_world)}
+            transform = mi.ScalarTransform4f(to_world.tolist())
+            return {"type": "envmap", "bitmap": mi.Bitmap(self.image), "to_world": transform}
+        if self.lobes is None:
+            raise ValueError("a light has lobes or an image")
         lobes = self.lobes.copy()
         lobes[:, :3] = lobes[:, :3] @ rotation.T
         return {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)}
@@ -97,8 +100,8 @@ def _read_camera(report: Path) -> Camera:
 
 
 def read_light(path: Path | None, avatar: Avatar, lobes: bool, count: int = 64) -> Light:
-    """The light of a `.json` or `.exr` file; without one, the avatar's own, which the fit found in the photo. An `.exr`
-    is taken as it is, or, where `lobes` are asked for, `count` of them are fitted to it.
+    """The light of a `.json` or `.exr` file; without one the avatar's own, which was fitted to the photo. With `lobes`,
+    an `.exr` is replaced by `count` lobes that are fitted to it.
 
     Raises InputError for a file that is missing, damaged or of another kind."""
     if path is None:

@@ -1,10 +1,11 @@
-"""What a head's surface shows of itself: points with their albedos, and what each sees in evenly spread directions.
+"""Estimates from a few thousand random points of a head's surface: bounces, shadows, how radiance and albedos vary.
 
-A few thousand points and rays, traced once before a picture, tell what its pixels need not trace."""
+They are made once before a picture, and tell what its pixels need not compute."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -16,6 +17,7 @@ from sira_mi.fields.sdf import deform, surface
 from sira_mi.sg.multisampling import COSINE
 from sira_mi.sg.radiance import Material, reflected_radiance
 from sira_mi.sg.visibility import (
+    DEFAULT_DIRECTIONS,
     SHADOW_OFFSET,
     Visibility,
     even_directions,
@@ -24,60 +26,75 @@ from sira_mi.sg.visibility import (
     trace_unoccluded,
 )
 
-_POINTS = 4096
+if TYPE_CHECKING:
+    from sira_mi.plugins.neural_albedo import NeuralAlbedo
+    from sira_mi.plugins.neural_sdf import NeuralSDF
+    from sira_mi.plugins.sira_bsdf import SiraBSDF
+
+_POINTS, _TRIANGLES = 4096, 4096
+# Directions in which each point looks for its neighbours.
 _DIRECTIONS = 64
-_TRIANGLES = 4096
-# Bounces that are followed one by one; what remains is extrapolated.
+# Bounces that are followed one by one; the rest is extrapolated.
 _BOUNCES = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Random points of a head's mesh, N columns."""
+    """N random points of a head's mesh."""
 
     point: np.ndarray  # [3, N]
     normal: np.ndarray  # [3, N] unit, of the field
     albedo: np.ndarray  # [3, N] diffuse
-    specular: np.ndarray  # [1, N]
-    neighbour: np.ndarray  # [K, N] point next to what is seen in each even direction; −1 where it is open
+    specular: np.ndarray  # [1, N] specular albedo
+    neighbour: np.ndarray  # [K, N] the point nearest to what is visible in each even direction; −1 where nothing is
 
     def at(self, index: np.ndarray) -> Surface:
-        """Some of the points; their neighbours keep the numbers that they have among all."""
-        return Surface(*(getattr(self, name)[:, index] for name in self.__dataclass_fields__))
+        """Some of the points; `neighbour` still counts among all."""
+        columns = (self.point, self.normal, self.albedo, self.specular, self.neighbour)
+        return Surface(*(values[:, index] for values in columns))
 
 
-def _albedos(shape, x: np.ndarray) -> list[np.ndarray]:
+def _albedos(shape: NeuralSDF, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Diffuse [3, N] and specular albedo [1, N] by the networks."""
-    field, bsdf = shape.field(), shape.bsdf()
+    field, bsdf = shape.field(), cast("SiraBSDF", shape.bsdf())
+    textures = [cast("NeuralAlbedo", t) for t in (bsdf.diffuse_albedo, bsdf.specular_albedo)]
 
     def columns(points):
         inputs = deform(field, points)
-        return tuple(t.evaluate_columns(*inputs) for t in (bsdf.diffuse_albedo, bsdf.specular_albedo))
+        return tuple(texture.evaluate_columns(*inputs) for texture in textures)
 
-    return evaluate_in_chunks(columns, x)
+    diffuse, specular = evaluate_in_chunks(columns, x)
+    return diffuse, specular
 
 
-def sample_surface(shape) -> Surface:
-    """Points of a `neural_sdf` that carries neural albedos. The same mesh gives the same points."""
+def _normals(shape: NeuralSDF, x: np.ndarray) -> np.ndarray:
+    """Unit normals [3, N] of the field."""
+    field = shape.field()
+    (gradient,) = evaluate_in_chunks(lambda p: surface(field, p)[1], x)
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+
+
+def sample_surface(shape: NeuralSDF) -> Surface:
+    """Random vertices of a `neural_sdf` with neural albedos. The same mesh gives the same points."""
     vertices = shape.vertices()
     rng = np.random.default_rng(0)
     chosen = np.sort(rng.choice(vertices.shape[1], min(_POINTS, vertices.shape[1]), replace=False))
-    x, field = vertices[:, chosen], shape.field()
-    (gradient,) = evaluate_in_chunks(lambda p: surface(field, p)[1], x)
-    normal = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+    x = vertices[:, chosen]
+    normal = _normals(shape, x)
     return Surface(x, normal, *_albedos(shape, x), _neighbours(shape, x, normal))
 
 
-def _neighbours(shape, x, normal):
+def _neighbours(shape: NeuralSDF, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
     axis = even_directions(_DIRECTIONS).axis
     offset = SHADOW_OFFSET * shape.voxel
-    scene, count = mi.load_dict({"type": "scene", "head": shape}), x.shape[1]
+    scene, count = _scene(shape), x.shape[1]
     direction = np.repeat(axis.T.astype(np.float32), count, axis=1)
     origin = np.tile(x + offset * normal, (1, _DIRECTIONS)) + offset * direction
     above = np.einsum("kc,cn->kn", axis, normal).ravel() > 0
     with dr.suspend_grad():
         origins, directions = (mi.Vector3f(np.ascontiguousarray(v, np.float32)) for v in (origin, direction))
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origins), directions), False, mi.Bool(above))
+        active: Any = mi.Bool(above)  # the stubs want a Bool of another module
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(origins), directions), active=active)
         blocked = np.flatnonzero(hit.is_valid().numpy().astype(bool) & above)
         place = origin[:, blocked] + hit.t.numpy()[blocked] * direction[:, blocked]
     neighbour = np.full(_DIRECTIONS * count, -1)
@@ -86,9 +103,13 @@ def _neighbours(shape, x, normal):
     return neighbour.reshape(_DIRECTIONS, count)
 
 
-def find_visible(shape, points: Surface, centre: np.ndarray) -> np.ndarray:
-    """Indices of the points that a camera at `centre` [3] sees."""
-    scene, offset = mi.load_dict({"type": "scene", "head": shape}), SHADOW_OFFSET * shape.voxel
+def _scene(shape: NeuralSDF) -> mi.Scene:
+    return cast(mi.Scene, mi.load_dict({"type": "scene", "head": shape}))
+
+
+def find_visible(shape: NeuralSDF, points: Surface, centre: np.ndarray) -> np.ndarray:
+    """Indices of the points that are visible from a camera at `centre` [3]."""
+    scene, offset = _scene(shape), SHADOW_OFFSET * shape.voxel
     towards = centre[:, None] - points.point
     towards /= np.linalg.norm(towards, axis=0)
     facing = np.flatnonzero((towards * points.normal).sum(axis=0) > 0)
@@ -108,12 +129,14 @@ def _radiance(points: Surface, view, roughness, k_s, lobes, visibility: Visibili
     return radiance.diffuse.numpy() + radiance.specular.numpy()
 
 
-def bounced_radiance(
+def reflect_bounces(
     points: Surface, lobes: np.ndarray | None, roughness: float, k_s: float, reflectance: float
 ) -> list[np.ndarray]:
-    """Radiance [N], strongest channel, that each point reflects of light which was reflected n = 1, 2, … times before,
-    from above: nothing shadows the first surface, and `reflectance` of the brightest neighbour is reflected
-    specularly. `lobes` None: every surface has a radiance of 1 at first. The last entry is all that remains."""
+    """Upper estimates of the radiance [N], strongest channel, that each point reflects of light that was reflected
+    n = 1, 2, … times before; the last entry is the rest of the series.
+
+    The light reaches the first surface unshadowed. The specular term reflects `reflectance` of the brightest neighbour.
+    With `lobes` None every surface has a radiance of 1 to begin with."""
     blocked = points.neighbour >= 0
     directions = even_directions(_DIRECTIONS)
     weight = np.maximum(directions.axis @ points.normal, 0) * directions.weight[:, None] / np.pi
@@ -140,13 +163,13 @@ def bounced_radiance(
 
 
 def shadow_error(
-    shape, points: Surface, centre: np.ndarray, lobes: np.ndarray, roughness: float, k_s: float, directions: int
+    shape: NeuralSDF, points: Surface, centre: np.ndarray, lobes: np.ndarray, roughness: float, k_s: float
 ) -> float:
-    """The most that closed-form radiance differs at `points`, seen from `centre` [3], without visibility."""
+    """The largest difference that visibility makes to the closed-form radiance at `points`, seen from `centre` [3]."""
     if points.point.shape[1] == 0:
         return 0.0
     view = _view(points, centre)
-    visibility = _visibility(shape, points, view, lobes, roughness, directions)
+    visibility = _visibility(shape, points, view, lobes, roughness)
     with_shadows, without = (_radiance(points, view, roughness, k_s, lobes, v) for v in (visibility, None))
     return float(np.abs(with_shadows - without).max())
 
@@ -157,23 +180,24 @@ def _view(points: Surface, centre: np.ndarray) -> np.ndarray:
     return view / np.linalg.norm(view, axis=0)
 
 
-def _visibility(shape, points: Surface, view, lobes, roughness, directions: int) -> Visibility:
-    chosen = light_directions(lobes, directions)
-    scene = mi.load_dict({"type": "scene", "head": shape})
-    unoccluded = trace_unoccluded(scene, points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
-    inputs = [_tensor(v) for v in (points.normal, view, points.specular)]
-    return light_visibility(*inputs, roughness, _tensor(lobes), chosen, _tensor(unoccluded))
+def _visibility(shape: NeuralSDF, points: Surface, view: np.ndarray, lobes: np.ndarray, roughness: float) -> Visibility:
+    chosen = light_directions(lobes, DEFAULT_DIRECTIONS)
+    unoccluded = trace_unoccluded(_scene(shape), points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
+    normal, outgoing, specular = (_tensor(v) for v in (points.normal, view, points.specular))
+    return light_visibility(
+        normal, outgoing, specular, mi.Float(roughness), _tensor(lobes), chosen, _tensor(unoccluded)
+    )
 
 
 def sharing_error(
-    shape, centre: np.ndarray, lobes: np.ndarray, roughness: float, k_s: float, directions: int, reach: float
+    shape: NeuralSDF, centre: np.ndarray, lobes: np.ndarray, roughness: float, k_s: float, reach: float
 ) -> float:
-    """The most that closed-form radiance, seen from `centre` [3], changes over `reach` scene units, by its slopes
-    between corners and centres of random triangles whose normals may share a shading."""
+    """The largest change of closed-form radiance, seen from `centre` [3], over `reach` scene units. It is extrapolated
+    from the slopes between corners and centres of random triangles whose normals are similar enough to share a
+    shading."""
     corners, centres = _random_triangles(shape)
-    field, points = shape.field(), np.concatenate([centres, corners], axis=1)
-    (gradient,) = evaluate_in_chunks(lambda p: surface(field, p)[1], points)
-    normal = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+    points = np.concatenate([centres, corners], axis=1)
+    normal = _normals(shape, points)
     everything = Surface(points, normal, *_albedos(shape, points), np.empty((0, points.shape[1]), int))
     view, count = _view(everything, centre), centres.shape[1]
     middle, corner = np.repeat(np.arange(count), 3), count + np.arange(3 * count)
@@ -181,25 +205,26 @@ def sharing_error(
     used &= (view * normal).sum(axis=0)[middle] < 0
     if not used.any():
         return 0.0
-    visibility = _visibility(shape, everything, view, lobes, roughness, directions)
+    visibility = _visibility(shape, everything, view, lobes, roughness)
     radiance = _radiance(everything, view, roughness, k_s, lobes, visibility)
     change = np.abs(radiance[:, corner] - radiance[:, middle]).max(axis=0)
     distance = np.linalg.norm(points[:, corner] - points[:, middle], axis=0)
     return reach * float((change / np.maximum(distance, 1e-6))[used].max())
 
 
-def baking_error(shape) -> tuple[float, float]:
-    """The most that diffuse and specular albedos interpolated between the vertices differ from the networks' at the
-    centres of random triangles of a `neural_sdf`."""
+def baking_error(shape: NeuralSDF) -> tuple[float, float]:
+    """The largest differences of diffuse and of specular albedo between interpolation from the vertices and the
+    networks, at the centres of random triangles."""
     corners, centres = _random_triangles(shape)
-    return tuple(
+    diffuse, specular = (
         float(np.abs(at_corners.reshape(len(at_corners), -1, 3).mean(axis=2) - at_centres).max())
         for at_corners, at_centres in zip(_albedos(shape, corners), _albedos(shape, centres), strict=True)
     )
+    return diffuse, specular
 
 
-def _random_triangles(shape) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [3, 3 T], those of a triangle consecutive, and centres [3, T] of random triangles of a `neural_sdf`."""
+def _random_triangles(shape: NeuralSDF) -> tuple[np.ndarray, np.ndarray]:
+    """Corners [3, 3 T], those of a triangle consecutive, and centres [3, T] of random triangles."""
     faces = mi.traverse(shape)["faces"].numpy().reshape(-1, 3)
     rng = np.random.default_rng(1)
     faces = faces[rng.choice(len(faces), min(_TRIANGLES, len(faces)), replace=False)]

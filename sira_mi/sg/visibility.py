@@ -28,6 +28,8 @@ from sira_mi.sg import brdf
 from sira_mi.sg.integrals import sphere_integral
 from sira_mi.sg.lobes import lobe_count, unpack_lobe
 
+# Directions in which `sira_sg` traces shadow rays, unless asked for others.
+DEFAULT_DIRECTIONS = 64
 # The sharpest lobe that K even directions over the sphere resolve, as a share of K.
 _RESOLVED = 0.25
 # Share of the light's energy that is added to both sums of a ratio, which is then 1 where there is no light.

@@ -19,6 +19,7 @@ from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface, extra
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, signed_distance, surface
 from sira_mi.files import write_png
+from sira_mi.portrait.camera import yaw_rotation
 from sira_mi.sg.radiance import Material, reflected_radiance
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
@@ -30,12 +31,6 @@ _DEPTH = 2.8  # half the depth that rays cross, scene units
 _VOXEL = 0.1  # of the grid that rays cross, scene units
 _KEY_LIGHT = np.array([-0.45, 0.45, 0.77], np.float32)  # unit, in view coordinates
 _BACKGROUND = 1.0
-
-
-def _view(yaw: float) -> np.ndarray:
-    """Rotation from the world to the view: x right, y up, z towards the camera; `yaw` in degrees."""
-    a = np.radians(yaw)
-    return np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
 
 
 def _shade(normals: np.ndarray, view: np.ndarray) -> np.ndarray:
@@ -81,7 +76,7 @@ def extracted_surface(field: SdfField, voxel: float = _VOXEL) -> ExtractedSurfac
 def head_tile(field: SdfField, extracted: ExtractedSurface | None = None, yaw: float = YAW) -> np.ndarray:
     """A shaded picture [H, W, 3] of a field's surface, display values in 0..1; plain background where there is none.
     `extracted` is the field's surface if it is known already."""
-    tile, view = blank_tile(), _view(yaw)
+    tile, view = blank_tile(), yaw_rotation(yaw)
     try:
         extracted = extracted or extracted_surface(field)
     except EmptySurfaceError:
@@ -106,7 +101,7 @@ def splat(points: np.ndarray, normals: np.ndarray, values: np.ndarray, yaw: floa
     """Points [P, 3] with normals [P, 3] towards the camera, painted three pixels wide, the nearest in front, with
     display values [P, 3]: a tile [H, W, 3]."""
     height, width = TILE
-    view, pixel = _view(yaw), _VIEW_HEIGHT / TILE[0]
+    view, pixel = yaw_rotation(yaw), _VIEW_HEIGHT / TILE[0]
     front = np.flatnonzero(normals @ view[2] > 0.05)
     x, y, z = view @ points[front].T
     order = np.argsort(z, kind="stable")
@@ -126,7 +121,7 @@ def splat(points: np.ndarray, normals: np.ndarray, values: np.ndarray, yaw: floa
 
 def scan_tile(points: np.ndarray, normals: np.ndarray, yaw: float = YAW) -> np.ndarray:
     """A scan's points [P, 3] shaded as `head_tile` shades, by their normals [P, 3]."""
-    return splat(points, normals, np.repeat(_shade(normals.T, _view(yaw))[:, None], 3, axis=1), yaw)
+    return splat(points, normals, np.repeat(_shade(normals.T, yaw_rotation(yaw))[:, None], 3, axis=1), yaw)
 
 
 def sheet(rows: list[list[np.ndarray]]) -> np.ndarray:
@@ -178,7 +173,7 @@ class AppearancePicture:
             diffuse = _unpacked(network, parameters, "diffuse_albedo", column["z_a"][:, k])
             specular = _unpacked(network, parameters, "specular_albedo", column["z_s"][:, k])
             lights = [lobes[:, :, k], lobes[:, :, (k + 1) % len(self.points)]]
-            away = -_view(YAW)[2].astype(np.float32)
+            away = -yaw_rotation(YAW)[2].astype(np.float32)
 
             def colors(normals, x_ref, gamma, diffuse=diffuse, specular=specular, lights=lights, away=away):
                 albedo = diffuse_albedo(diffuse, self.architecture.albedo_octaves, x_ref, gamma)

@@ -50,12 +50,17 @@ def closed_form(points: Points, lobes: np.ndarray, roughness: float, k_s: float)
 
 
 def with_visibility(
-    points: Points, scene: mi.Scene, head: mi.Shape, lobes: np.ndarray, roughness: float, k_s: float,
-    albedos: tuple[np.ndarray, np.ndarray] | None = None, bounce: bool = True, count: int = 64,
-) -> np.ndarray:  # fmt: skip
+    points: Points,
+    scene: mi.Scene,
+    head: mi.Shape,
+    lobes: np.ndarray,
+    roughness: float,
+    k_s: float,
+    bounce: bool = True,
+) -> np.ndarray:
     """Radiance [3, N] by the closed form with visibility, as `sira_sg` computes it; `bounce` adds the light off what
     blocks."""
-    light, directions = _tensor(lobes), visibility.light_directions(lobes, count)
+    light, directions = _tensor(lobes), visibility.light_directions(lobes, visibility.DEFAULT_DIRECTIONS)
     factor = 1.0 if bounce else 0.0
 
     def columns(x, normal, view, diffuse, specular):
@@ -66,8 +71,7 @@ def with_visibility(
         radiance = reflected_radiance(normal, -view, material, light, seen)
         return radiance.diffuse + radiance.specular
 
-    diffuse, specular = albedos or (points.diffuse, points.specular)
-    return evaluate_in_chunks(columns, points.x, points.normal, points.view, diffuse, specular)[0]
+    return evaluate_in_chunks(columns, points.x, points.normal, points.view, points.diffuse, points.specular)[0]
 
 
 def _hemisphere_integral(sharpness, cosine):
