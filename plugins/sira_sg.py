@@ -22,6 +22,7 @@ from sira_mi.sg.layers import EXTRA_LAYERS, channel_count, extra_channel_names
 from sira_mi.sg.multisampling import representative_samples
 from sira_mi.sg.radiance import Material, Radiance, reflected_radiance
 from sira_mi.sg.visibility import (
+    DEFAULT_DIRECTIONS,
     SHADOW_OFFSET,
     Directions,
     light_directions,
@@ -100,7 +101,7 @@ class SiraSG(mi.SamplingIntegrator):
         super().__init__(props)
         self.hide_environment = bool(props.get("hide_emitters", False))
         self.visibility = bool(props.get("visibility", True))
-        self.directions = int(props.get("visibility_directions", visibility.DEFAULT_DIRECTIONS))
+        self.directions = int(props.get("visibility_directions", DEFAULT_DIRECTIONS))
         if not 16 <= self.directions <= 4096:
             raise InputError(f"sira_sg: visibility_directions is {self.directions}; it must be 16 to 4096")
         self.aovs = bool(props.get("aovs", True))
