@@ -119,6 +119,10 @@ class NeuralSDF(mi.Mesh):
         """Vertices [3, V] of the mesh in the field's coordinates."""
         return self._x0.numpy()
 
+    def faces(self) -> np.ndarray:
+        """Triangles [T, 3] of the mesh, by indices of its vertices."""
+        return self._faces.numpy().reshape(-1, 3)
+
     def remesh_at_next_update(self) -> None:
         """Makes the next update of the parameters extract the mesh, and starts the count of `remesh_every` there."""
         self._updates = self.remesh_every - 1

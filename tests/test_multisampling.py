@@ -101,9 +101,7 @@ def test_hits_of_the_mesh_are_close_to_those_of_the_field(avatar, avatar_path, s
     """The blob is smooth: a mesh of spacing 0.1 shows it within a percent, with the albedos of networks and of
     vertices alike."""
     inside = every_sample[..., MASK] > 0.99
-    description = scenes.head(avatar_path, voxel=0.1)
-    for texture in ("diffuse_albedo", "specular_albedo"):
-        description["bsdf"][texture]["baked"] = True
+    description = scenes.head(avatar_path, voxel=0.1, baked=True)
     baked = mi.load_dict(
         {
             "type": "scene",

@@ -46,9 +46,7 @@ def lights(tmp_path):
 
 
 def baked_scene(avatar_path, voxel=0.1):
-    description = head(avatar_path, voxel)
-    for name in ("diffuse_albedo", "specular_albedo"):
-        description["bsdf"][name]["baked"] = True
+    description = head(avatar_path, voxel, baked=True)
     return mi.load_dict({"type": "scene", "head": description, "sensor": sensor(VIEW)})
 
 

@@ -1,6 +1,7 @@
 """The scene files: they open for every integrator, every parameter does what it says, and files are found."""
 
 import shutil
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mitsuba as mi
@@ -9,7 +10,7 @@ import pytest
 from conftest import camera
 
 from sira_mi.avatar.file import load_avatar
-from sira_mi.fit.output import write_scene
+from sira_mi.export.scene_file import fitted_scene, scene_xml, write_scene
 from sira_mi.sg.lights_io import read_lights, write_lights
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -132,3 +133,17 @@ def test_learned_radiance_is_that_of_the_scenes_own_avatar(avatar_path):
     )
     np.testing.assert_array_equal(image, picture(named))
     assert "z_r" in mi.traverse(own.integrator()), "exposed from the first render on"
+
+
+def test_what_scene_files_cannot_hold_is_said():
+    description = {"type": "scene", "light": {"type": "sg_envmap", "lobes": mi.TensorXf([[0, 1, 0, 1, 1, 1, 1]])}}
+    with pytest.raises(TypeError, match="lobes: scene files hold no TensorXf"):
+        scene_xml(description, "")
+
+
+def test_the_shipped_scene_is_that_of_the_descriptions():
+    """`fit.xml` says the same of a head, its light and its integrator as the scene of a fit does."""
+    shipped, fitted = ET.parse(SCENES / "fit.xml").getroot(), ET.fromstring(scene_xml(fitted_scene(camera(40.0)), ""))
+    for element in ("shape", "emitter", "sensor/film/rfilter", "sensor/sampler"):
+        one, other = (ET.canonicalize(ET.tostring(root.find(element)), strip_text=True) for root in (shipped, fitted))
+        assert one == other, element

@@ -216,9 +216,7 @@ def shadowed(avatar_path):
     the closed form with and without visibility."""
     lobes = np.array([[0.7, 0.4, 0.6, 40, 20, 18, 15], [0, 0.6, 0.8, 1, 0.3, 0.35, 0.4]], np.float32)
     lobes[:, :3] = unit(lobes[:, :3].T).T
-    head = scenes.head(avatar_path, voxel=0.1)
-    for texture in ("diffuse_albedo", "specular_albedo"):
-        head["bsdf"][texture]["baked"] = True
+    head = scenes.head(avatar_path, voxel=0.1, baked=True)
     description = {
         "type": "scene",
         "head": mi.load_dict(head),

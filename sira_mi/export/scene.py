@@ -1,6 +1,7 @@
 """Mitsuba scene descriptions: a camera, a head and its light, as dictionaries for `mi.load_dict`."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -11,7 +12,14 @@ from sira_mi.portrait.camera import Camera, yaw_rotation
 _OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-def film(width: int, height: int) -> dict:
+class Parameter(NamedTuple):
+    """A value that a scene file leaves open, with its default: `mi.load_file(path, NAME=value)`."""
+
+    name: str
+    default: bool | int | float | str
+
+
+def film(width: int | Parameter, height: int | Parameter) -> dict:
     """An RGBA film of float32 with a box filter, so that every sample belongs to one pixel."""
     return {
         "type": "hdrfilm",
@@ -23,22 +31,15 @@ def film(width: int, height: int) -> dict:
     }
 
 
-def principal_point_offset(camera: Camera) -> tuple[float, float]:
-    """Mitsuba's offset of the film's centre from the principal point, in film sizes."""
-    k = camera.K
-    return float(0.5 - k[0, 2] / camera.width), float(0.5 - k[1, 2] / camera.height)
-
-
 def sensor(camera: Camera, sampler: dict | None = None) -> dict:
     """A perspective sensor that is the OpenCV `camera`; its pixels are square."""
     to_world = np.linalg.inv(camera.world_to_camera) @ _OPENCV_TO_MITSUBA
-    x, y = principal_point_offset(camera)
     return {
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.K[0, 0])))),
-        "principal_point_offset_x": x,
-        "principal_point_offset_y": y,
+        "principal_point_offset_x": float(0.5 - camera.K[0, 2] / camera.width),
+        "principal_point_offset_y": float(0.5 - camera.K[1, 2] / camera.height),
         "near_clip": 0.001,
         "far_clip": 1000.0,
         "to_world": mi.ScalarTransform4f(to_world),
@@ -47,20 +48,27 @@ def sensor(camera: Camera, sampler: dict | None = None) -> dict:
     }
 
 
-def head(avatar: str | Path, voxel: float = 0.05, **options) -> dict:
-    """A `neural_sdf` with the neural albedos and the BRDF of an avatar file (empty path: the shipped prior)."""
-    path = str(avatar)
-    return {
-        "type": "neural_sdf",
-        "avatar": path,
-        "voxel": voxel,
-        **options,
-        "bsdf": {
-            "type": "sira_bsdf",
-            "diffuse_albedo": {"type": "neural_albedo", "avatar": path, "kind": "diffuse"},
-            "specular_albedo": {"type": "neural_albedo", "avatar": path, "kind": "specular"},
-        },
+def head(
+    avatar: str | Path | Parameter, voxel: float | Parameter = 0.05, baked: bool | Parameter = False, **options
+) -> dict:
+    """A `neural_sdf` with the neural albedos and the BRDF of an avatar file (empty path: the shipped prior), the
+    albedos `baked` at the vertices or evaluated as networks."""
+    path = str(avatar) if isinstance(avatar, Path) else avatar
+    albedos = {
+        f"{kind}_albedo": {"type": "neural_albedo", "avatar": path, "kind": kind, "baked": baked}
+        for kind in ("diffuse", "specular")
     }
+    return {"type": "neural_sdf", "avatar": path, "voxel": voxel, **options, "bsdf": {"type": "sira_bsdf", **albedos}}
+
+
+def sg_light(lobes: np.ndarray) -> dict:
+    """The light of lobes [N_l, 7]."""
+    return {"type": "sg_envmap", "lobes": mi.TensorXf(np.ascontiguousarray(lobes, np.float32))}
+
+
+def head_scene(integrator: dict, sensor: dict, head: dict | mi.Object, light: dict) -> dict:
+    """A scene of one head; their parameters are known as `head.…` and `light.…`."""
+    return {"type": "scene", "integrator": integrator, "sensor": sensor, "head": head, "light": light}
 
 
 def orbit(camera: Camera, yaw_degrees: float) -> Camera:

@@ -20,7 +20,9 @@ import sira_mi
 from sira_mi.avatar.file import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
 from sira_mi.decisions import Plan, explain
 from sira_mi.errors import InputError
+from sira_mi.export.mesh import write_mesh
 from sira_mi.export.scene import orbit
+from sira_mi.export.scene_file import write_scene
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
@@ -295,14 +297,14 @@ def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, rep
     write_lights(out / "lights.json", lobes)
     write_exr(out / "lights.exr", render_environment(lobes, 128))
     write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
-    output.write_scene(out / "scene.xml", portrait.camera)
+    write_scene(out / "scene.xml", portrait.camera)
 
     scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
     layers = output.render_layers(scene)
     with contextlib.suppress(FileExistsError):
         (out / "renders").mkdir()
     output.write_renders(out / "renders", layers)
-    output.write_mesh(out / "mesh.ply", scene.shapes()[0])
+    write_mesh(out / "mesh.ply", scene.shapes()[0])
 
     box = output.head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
     close = output.box_camera(portrait.camera, box)

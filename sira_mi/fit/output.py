@@ -1,4 +1,4 @@
-"""What a fit leaves behind: avatar, scene, mesh, lights, renders with previews, a report and a contact sheet.
+"""Pictures and the report that a fit leaves behind: renders with previews, a contact sheet, `avatar.json`.
 
 Everything is written into one folder by functions that write under a temporary name first."""
 
@@ -11,10 +11,7 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from sira_mi.conventions import MILLIMETRES_PER_UNIT
-from sira_mi.export.scene import head, principal_point_offset, sensor
-from sira_mi.fields.columns import evaluate_in_chunks
-from sira_mi.fields.sdf import surface
+from sira_mi.export.scene import head, head_scene, sensor, sg_light
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
@@ -59,15 +56,9 @@ def avatar_scene(
     spread samples in each pixel, against jagged outlines. `extra_channels` are those of `sira_sg`.
     `in_photo`: the lobes are the avatar's own, and its refinement of that light is in the radiance."""
     refinement = {"light_refinement": avatar_path} if in_photo else {}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "sira_sg", "hide_emitters": True, "aovs": extra_channels, **refinement},
-            "sensor": sensor(camera, {"type": "stratified", "sample_count": _SAMPLES}),
-            "head": head(avatar_path, voxel),
-            "light": {"type": "sg_envmap", "lobes": mi.TensorXf(lobes)},
-        }
-    )
+    integrator = {"type": "sira_sg", "hide_emitters": True, "aovs": extra_channels, **refinement}
+    eye = sensor(camera, {"type": "stratified", "sample_count": _SAMPLES})
+    return mi.load_dict(head_scene(integrator, eye, head(avatar_path, voxel), sg_light(lobes)))
 
 
 def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
@@ -76,88 +67,6 @@ def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
         if name != "mask":
             write_exr(folder / f"{name}.exr", image)
         write_png(folder / f"{name}.png", preview(name, image, layers["mask"]))
-
-
-def write_mesh(path: Path, shape) -> None:
-    """A PLY of a `neural_sdf` in metres (+y up, facing +z), with the field's normals and, as vertex colours, the sRGB
-    diffuse albedo."""
-    import trimesh
-
-    vertices = shape.vertices()
-    field, texture = shape.field(), shape.bsdf().diffuse_albedo
-
-    def columns(x):
-        _, gradient, x_ref, gamma = surface(field, x)
-        return gradient, texture.evaluate_columns(x_ref, gamma)
-
-    gradient, albedo = evaluate_in_chunks(columns, vertices)
-    mesh = trimesh.Trimesh(
-        vertices.T * (MILLIMETRES_PER_UNIT / 1000),
-        mi.traverse(shape)["faces"].numpy().reshape(-1, 3),
-        vertex_normals=(gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)).T,
-        vertex_colors=(linear_to_srgb(np.clip(albedo.T, 0, 1)) * 255 + 0.5).astype(np.uint8),
-        process=False,
-    )
-    write_through(path, lambda p: p.write_bytes(mesh.export(file_type="ply", vertex_normal=True)))
-
-
-def write_scene(path: Path, camera: Camera) -> None:
-    """`scene.xml`: the fitted scene, opened by `mi.load_file` after `import sira_mi`; files are found beside it."""
-    x, y = principal_point_offset(camera)
-    to_world = mi.ScalarTransform4f(sensor(camera)["to_world"]).matrix
-    matrix = " ".join(f"{v:.9g}" for v in np.array(to_world).ravel())
-    fov = sensor(camera)["fov"]
-    text = f"""<?xml version="1.0" encoding="utf-8"?>
-<!-- A head fitted by SIRA for Mitsuba 3: import sira_mi; mitsuba.load_file("scene.xml", integrator="path") -->
-<scene version="3.0.0">
-    <default name="avatar" value="avatar.safetensors"/>
-    <default name="lights" value="lights.json"/>
-    <default name="integrator" value="sira_sg"/>
-    <default name="width" value="{camera.width}"/>
-    <default name="height" value="{camera.height}"/>
-    <default name="spp" value="16"/>
-    <default name="voxel" value="0.05"/>
-    <!-- Albedos interpolated between vertices, without gradients: quick for path, ignored by sira_sg. -->
-    <default name="baked" value="true"/>
-    <integrator type="$integrator"/>
-    <sensor type="perspective">
-        <string name="fov_axis" value="x"/>
-        <float name="fov" value="{fov:.9g}"/>
-        <float name="principal_point_offset_x" value="{x:.9g}"/>
-        <float name="principal_point_offset_y" value="{y:.9g}"/>
-        <float name="near_clip" value="0.01"/>
-        <float name="far_clip" value="1000"/>
-        <transform name="to_world"><matrix value="{matrix}"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
-        <film type="hdrfilm">
-            <integer name="width" value="$width"/>
-            <integer name="height" value="$height"/>
-            <string name="pixel_format" value="rgba"/>
-            <rfilter type="box"/>
-        </film>
-    </sensor>
-    <shape type="neural_sdf" id="head">
-        <string name="avatar" value="$avatar"/>
-        <float name="voxel" value="$voxel"/>
-        <bsdf type="sira_bsdf">
-            <texture type="neural_albedo" name="diffuse_albedo">
-                <string name="avatar" value="$avatar"/>
-                <string name="kind" value="diffuse"/>
-                <boolean name="baked" value="$baked"/>
-            </texture>
-            <texture type="neural_albedo" name="specular_albedo">
-                <string name="avatar" value="$avatar"/>
-                <string name="kind" value="specular"/>
-                <boolean name="baked" value="$baked"/>
-            </texture>
-        </bsdf>
-    </shape>
-    <emitter type="sg_envmap" id="light">
-        <string name="filename" value="$lights"/>
-    </emitter>
-</scene>
-"""
-    write_through(path, lambda p: p.write_text(text, encoding="utf-8"))
 
 
 def box_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:

@@ -19,7 +19,7 @@ from skimage.transform import resize_local_mean
 
 from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, refined_albedo, specular_albedo
 from sira_mi.avatar.file import Avatar, load_avatar
-from sira_mi.export.scene import head, sensor
+from sira_mi.export.scene import head, head_scene, sensor, sg_light
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.sdf import deform
 from sira_mi.fit.appearance import AppearanceProblem
@@ -153,19 +153,11 @@ def polish_scene(portrait: Portrait, avatar_path: str | Path, settings: FitSetti
     width, height = round((x1 - x0) * factor), round((y1 - y0) * factor)
     camera = portrait.camera.cropped(x0, y0, x1 - x0, y1 - y0)
     camera = camera.scaled(width / camera.width, height / camera.height, width, height)
-    avatar, description = load_avatar(avatar_path), head(avatar_path, settings.final_voxel)
+    avatar, description = load_avatar(avatar_path), head(avatar_path, settings.final_voxel, baked=True)
     description["bsdf"]["roughness"] = avatar.roughness
-    for texture in ("diffuse_albedo", "specular_albedo"):
-        description["bsdf"][texture]["baked"] = True
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "prb", "max_depth": settings.polish.depth, "hide_emitters": True},
-            "sensor": sensor(camera, {"type": "ldsampler", "sample_count": settings.polish.samples}),
-            "head": description,
-            "light": {"type": "sg_envmap", "lobes": mi.TensorXf(avatar.tensors["lobes"])},
-        }
-    )
+    integrator = {"type": "prb", "max_depth": settings.polish.depth, "hide_emitters": True}
+    eye = sensor(camera, {"type": "ldsampler", "sample_count": settings.polish.samples})
+    scene = mi.load_dict(head_scene(integrator, eye, description, sg_light(avatar.tensors["lobes"])))
     parameters = mi.traverse(scene)
     parameters["head.bsdf.diffuse_albedo.k_r"] = 1.0
     parameters.update()

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.errors import InputError
-from sira_mi.export.scene import head, orbit, sensor
+from sira_mi.export.scene import head, head_scene, orbit, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_exr, write_png
 from sira_mi.portrait.camera import Camera, yaw_rotation
@@ -56,13 +56,11 @@ def load_head(subject: Subject, settings: RelightSettings) -> NeuralSDF:
     """The subject's head as a Mitsuba shape; one serves any number of scenes.
 
     Raises InputError when the avatar's field has no surface."""
-    description = head(subject.path.absolute(), settings.voxel)
+    baked = settings.on_mesh if settings.integrator == "sg" else not settings.exact
+    description = head(subject.path.absolute(), settings.voxel, baked)
     bsdf = description["bsdf"]
     bsdf["roughness"] = subject.avatar.roughness
     bsdf["k_s"] = subject.avatar.k_s if settings.specular else 0.0
-    if settings.on_mesh if settings.integrator == "sg" else not settings.exact:
-        for texture in ("diffuse_albedo", "specular_albedo"):
-            bsdf[texture]["baked"] = True
     if settings.integrator == "path" and not settings.specular:
         description["bsdf"] = {"type": "diffuse", "reflectance": bsdf["diffuse_albedo"]}
     try:
@@ -101,8 +99,7 @@ def load_scene(
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         eye["film"] |= dict(zip(names, head_window(shape, view), strict=True))
     emitter = light.emitter(yaw_rotation(-yaw_degrees))
-    scene = {"type": "scene", "integrator": integrator, "sensor": eye, "head": shape, "light": emitter}
-    return cast(mi.Scene, mi.load_dict(scene))
+    return cast(mi.Scene, mi.load_dict(head_scene(integrator, eye, shape, emitter)))
 
 
 def head_window(shape: NeuralSDF, camera: Camera) -> tuple[int, int, int, int]:

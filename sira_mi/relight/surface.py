@@ -225,7 +225,7 @@ def baking_error(shape: NeuralSDF) -> tuple[float, float]:
 
 def _random_triangles(shape: NeuralSDF) -> tuple[np.ndarray, np.ndarray]:
     """Corners [3, 3 T], those of a triangle consecutive, and centres [3, T] of random triangles."""
-    faces = mi.traverse(shape)["faces"].numpy().reshape(-1, 3)
+    faces = shape.faces()
     rng = np.random.default_rng(1)
     faces = faces[rng.choice(len(faces), min(_TRIANGLES, len(faces)), replace=False)]
     corners = shape.vertices()[:, faces.ravel()]

@@ -36,11 +36,9 @@ class Case:
     def head(self, voxel: float, baked: bool = True) -> mi.Shape:
         """The head as a shape whose mesh has the spacing `voxel` (scene units), its albedos kept at the vertices or
         evaluated as networks at every hit."""
-        description = scenes.head(self.avatar, voxel, to_world=mi.ScalarTransform4f(self.to_world))
+        description = scenes.head(self.avatar, voxel, baked, to_world=mi.ScalarTransform4f(self.to_world))
         bsdf = description["bsdf"]
         bsdf["roughness"], bsdf["k_s"] = self.roughness, self.k_s
-        for texture in ("diffuse_albedo", "specular_albedo"):
-            bsdf[texture]["baked"] = baked
         return mi.load_dict(description)
 
     def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:

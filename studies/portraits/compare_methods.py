@@ -121,7 +121,7 @@ def mean_head(photo: Path, prior_path: Path) -> PredictedHead:
     prior = load_avatar(prior_path)
     portrait = make_portrait(photo, PortraitSettings(), prior.tensors["landmarks"])
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(prior_path), "voxel": 0.05})
-    faces = mi.traverse(head)["faces"].numpy().reshape(-1, 3)
+    faces = head.faces()
     return PredictedHead(head.vertices().T, faces, prior.tensors["landmarks"], portrait.camera)
 
 

@@ -78,7 +78,7 @@ def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settin
         pictures = output.render_layers(scene)
     arrays = {
         "vertices": head.vertices().T,
-        "faces": mi.traverse(head)["faces"].numpy().reshape(-1, 3),
+        "faces": head.faces(),
         "landmarks": landmarks_of(prior, head.field()),
         "K": camera.K,
         "world_to_camera": camera.world_to_camera,

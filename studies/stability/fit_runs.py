@@ -129,7 +129,7 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
     shown = (linear_to_srgb(portrait.image), linear_to_srgb(layers["final"]), 0.5 + 0.5 * layers["normal"])
     write_png(picture, np.concatenate(shown, axis=1))
 
-    vertices, faces = head.vertices().T, mi.traverse(head)["faces"].numpy().reshape(-1, 3)
+    vertices, faces = head.vertices().T, head.faces()
     landmarks = landmarks_of(prior, head.field())
     height, width = truth.mask.shape
     scale = camera.width / width, camera.height / height
