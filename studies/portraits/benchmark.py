@@ -117,10 +117,11 @@ def _limit_threads(count: int) -> None:
 
 
 def take_portraits(task: tuple[Source, list[Shot]], out: Path, photo: PhotoSettings) -> list[dict]:
-    """Entries of the portraits of one head; those that are not in `out` under the same key are taken now."""
+    """Entries of the portraits of one head; those that are not in `out` under the same key are rendered now."""
     source, shots = task
-    entries = {shot.name: read_entry(out / shot.name, shot.key(photo)) for shot in shots}
-    if all(entries.values()):
+    found = {shot.name: read_entry(out / shot.name, shot.key(photo)) for shot in shots}
+    entries = {name: entry for name, entry in found.items() if entry is not None}
+    if len(entries) == len(shots):
         return list(entries.values())
     if mi.variant() != VARIANT:
         mi.set_variant(VARIANT)
@@ -131,14 +132,14 @@ def take_portraits(task: tuple[Source, list[Shot]], out: Path, photo: PhotoSetti
     roughness = draw_roughness(np.random.default_rng([identity.seed, 51]))
     view = View(subject.parts, roughness, *camera, photo)
     for shot in shots:
-        if entries[shot.name] is None:
+        if shot.name not in entries:
             image, arrays = portrait(view, subject, shot)
             seconds, started = time.process_time() - started, time.process_time()
             measured = {"clipped": _clipped(arrays), "core_seconds": round(seconds, 1)}
             by_code = {"roughness": {str(code): value for code, value in roughness.items()}}
             entries[shot.name] = shot.entry() | by_code | measured
             write_portrait(out / shot.name, image, arrays, shot, entries[shot.name], shot.key(photo))
-    return list(entries.values())
+    return [entries[shot.name] for shot in shots]
 
 
 def rebuild_subject(source: Source, identity: Identity) -> Subject:

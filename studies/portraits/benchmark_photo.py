@@ -73,8 +73,8 @@ def principled_mesh(name: str, part: Part, strength: float, roughness: dict[int,
     )
     mesh = mesh_of(name, part, props)
     rough = np.array([roughness[code] for code in range(len(roughness))])[part.region]
-    mesh.add_attribute("face_roughness", 1, rough.astype(np.float32))
-    mesh.add_attribute("face_region", 1, part.region.astype(np.float32))
+    mesh.add_attribute("face_roughness", 1, rough.tolist())
+    mesh.add_attribute("face_region", 1, part.region.astype(float).tolist())
     return mesh
 
 
@@ -103,7 +103,7 @@ class View:
         self.centres = np.flatnonzero(self.truth["region"].reshape(-1) != NOTHING)
 
     def _lit(self, light):
-        scene = {f"part{i}": mesh for i, mesh in enumerate(self.meshes)}
+        scene: dict[str, object] = {f"part{i}": mesh for i, mesh in enumerate(self.meshes)}
         scene["light"] = {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32)), "mis_compensation": True}
         return mi.load_dict({"type": "scene", **scene})
 
@@ -230,7 +230,7 @@ class View:
         sampler.set_samples_per_wavefront(per_launch)
         sampler.seed(seed, count * per_launch)
         chosen = mi.UInt32(pixels.astype(np.uint32))
-        total = 0.0
+        total: np.ndarray | float = 0.0
         for _ in range(samples // per_launch):
             lane = dr.arange(mi.UInt32, count * per_launch)
             channels = sample(sampler, dr.gather(mi.UInt32, chosen, lane // per_launch))

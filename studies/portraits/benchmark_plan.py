@@ -164,7 +164,9 @@ def choose_identities(heads: list[Identity], count: int, seed: int) -> list[Iden
     decides between equals. The result is in the order of the sources."""
     rank = {head.title: hashlib.sha256(f"{seed}/{head.title}".encode()).hexdigest() for head in heads}
     left = sorted(heads, key=lambda head: rank[head.title])
-    chosen, seen, taken = [], Counter(), Counter()
+    chosen: list[Identity] = []
+    seen: Counter[tuple] = Counter()
+    taken: Counter[str] = Counter()
     while left and len(chosen) < count:
         sources = sorted({head.source for head in left})
         source = min(sources, key=lambda name: ((taken[name] + 1) / SHARES[name], name))

@@ -67,9 +67,10 @@ def _complete(names: Sequence[str]) -> list[str]:
     """The methods and those that they go on from, in the order of `METHODS`."""
     if unknown := set(names) - set(BY_NAME):
         raise InputError(f"unknown methods {', '.join(sorted(unknown))}; known are {', '.join(BY_NAME)}")
-    wanted: set[str | None] = set()
-    for name in names:
-        while name not in wanted and name is not None:
+    wanted: set[str] = set()
+    for first in names:
+        name: str | None = first
+        while name is not None and name not in wanted:
             wanted.add(name)
             name = BY_NAME[name].after
     return [method.name for method in METHODS if method.name in wanted]
@@ -125,13 +126,13 @@ def mean_head(photo: Path, prior_path: Path) -> PredictedHead:
     return PredictedHead(head.vertices().T, faces, prior.tensors["landmarks"], portrait.camera)
 
 
-def _read_head(out: Path, shaded: bool, truth: Truth) -> tuple[PredictedHead, PredictedAppearance | None]:
+def _read_head(out: Path, with_appearance: bool, truth: Truth) -> tuple[PredictedHead, PredictedAppearance | None]:
     height, width = truth.mask.shape
     with np.load(out / "head.npz", allow_pickle=False) as data:
         camera = Camera(data["K"], data["world_to_camera"], width, height)
         image = {name.removeprefix("image/"): data[name] for name in data.files if name.startswith("image/")}
         head = PredictedHead(data["vertices"], data["faces"], data["landmarks"], camera, image["normal"], image["mask"])
-    if not shaded:
+    if not with_appearance:
         return head, None
     names = ("final", "diffuse_albedo", "specular_albedo", "mask")
     shaded = image["diffuse"] + image["specular"]

@@ -168,11 +168,11 @@ def score_geometry(
         scores[f"{name}_turn"] = _angle(map.rotation)
         scores |= _distances(name, map(points), distances_from(surface.outer.points, tree, map), own, truth, surface)
 
-    images = None
-    if prediction.normal is None or prediction.mask is None:
+    normal, mask = prediction.normal, prediction.mask
+    if normal is None or mask is None:
         images = mesh_images(prediction.vertices, prediction.faces, prediction.camera)
-    normal = images.normal if prediction.normal is None else prediction.normal
-    mask = images.mask if prediction.mask is None else prediction.mask
+        normal = images.normal if normal is None else normal
+        mask = images.mask if mask is None else mask
     scores |= score_normals(normal, mask, prediction.camera, truth, surface)
     modelled = modelled_pixels(truth.camera)
     scores["silhouette_iou"] = silhouette_iou(np.where(modelled, mask, 0), np.where(modelled, truth.mask, 0))
@@ -228,7 +228,7 @@ def _distances(name, predicted, own_distance, own, truth, surface) -> dict[str, 
     distances of the truth's samples to the prediction."""
     distance, nearest, face = surface.tree.nearest(predicted)
     there = _regions(truth, surface, predicted, nearest, face)
-    scores = {}
+    scores: dict[str, float] = {}
     for region in REGIONS:
         sides = own_distance[own[region]], distance[there[region]]
         means = []

@@ -47,28 +47,33 @@ class TriangleTree:
         order = np.argsort(_morton(points), kind="stable")
         _, start = self._centroids.query(points[order])
         best = np.zeros(len(points), np.int64)
+        lower, upper, corners = (mi.Float64(a.ravel()) for a in (*self._boxes, self._corners))
         best[order] = _walk(
             mi.Vector3d(np.ascontiguousarray(points[order].T)),
             mi.UInt32(start.astype(np.uint32)),
-            *(mi.Float64(a.ravel()) for a in (*self._boxes, self._corners)),
+            lower,
+            upper,
+            corners,
             dr.opaque(mi.UInt32, self._leaves),
         ).numpy()
-        corners = self._corners[best]
-        found = np.einsum("nk,nkd->nd", closest_on_triangles(points, corners), corners)
+        nearest = self._corners[best]
+        found = np.einsum("nk,nkd->nd", closest_on_triangles(points, nearest), nearest)
         return np.linalg.norm(found - points, axis=1), found, self._face[best]
 
 
 def nearest_reference(
     points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `TriangleTree.nearest` gives, by trying every triangle for every point."""
+    """The result of `TriangleTree.nearest`, by trying every triangle for every point."""
     corners = np.asarray(vertices, np.float64)[np.asarray(faces, np.int64)]
-    rows = []
+    distances, closest, indices = [], [], []
     for point in np.asarray(points, np.float64):
         found = np.einsum("tk,tkd->td", closest_on_triangles(point[None], corners), corners)
         distance = np.linalg.norm(found - point, axis=1)
-        rows.append((distance.min(), found[distance.argmin()], distance.argmin()))
-    return tuple(np.array(column) for column in zip(*rows, strict=True))
+        distances.append(distance.min())
+        closest.append(found[distance.argmin()])
+        indices.append(distance.argmin())
+    return np.array(distances), np.array(closest), np.array(indices)
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

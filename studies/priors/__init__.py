@@ -1,1 +1,1 @@
-"""Evidence for the priors, measured on heads that they have not seen, and what each loss term and size is for."""
+"""How well priors describe heads that they have not seen, and what each loss term and network size is for."""

@@ -8,6 +8,7 @@ measured again, and write figures (`docs/data/priors.json`), pictures and pages.
 import argparse
 import shutil
 import time
+from functools import partial
 from pathlib import Path
 
 from sira_mi.errors import CommandParser, InputError, run_command
@@ -61,8 +62,7 @@ def measure(arguments: argparse.Namespace) -> None:
     write_figures(arguments.out / FIGURES, summarise(evidence))
     (arguments.out / "images").mkdir(exist_ok=True)
     for picture in sorted(evidence.glob("*.png")):
-        copy = arguments.out / "images" / picture.name
-        write_through(copy, lambda file, picture=picture: shutil.copyfile(picture, file))
+        write_through(arguments.out / "images" / picture.name, partial(shutil.copyfile, picture))
 
 
 if __name__ == "__main__":

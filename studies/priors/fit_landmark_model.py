@@ -60,5 +60,5 @@ def measure_held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]
         for head in np.flatnonzero(fold == k):
             placed = mi.TensorXf(np.ascontiguousarray(found.placed[head, known].T))
             modelled[head, known] = model(placed).numpy().T
-    errors = [np.linalg.norm(landmarks - found.true, axis=2) for landmarks in (found.placed, modelled)]
-    return tuple(float(np.nanmean(error)) * MILLIMETRES_PER_UNIT for error in errors)
+    before, after = (np.linalg.norm(landmarks - found.true, axis=2) for landmarks in (found.placed, modelled))
+    return float(np.nanmean(before)) * MILLIMETRES_PER_UNIT, float(np.nanmean(after)) * MILLIMETRES_PER_UNIT

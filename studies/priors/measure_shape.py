@@ -65,12 +65,13 @@ def measure_shape_prior(collection: Path, runs: Path, measures: Measures | None 
     fits = part("fits", lambda: _fits(prior, scans, measures, evidence / "prior_fits.png"), "prior_fits.png")
     part("heads", lambda: _heads(prior, measures.heads, evidence), "prior_samples_1.png", "prior_samples_2.png")
     part("directions", lambda: _directions(trained, evidence / "prior_directions.png"), "prior_directions.png")
-    part("landmarks", lambda: _landmarks(prior, trained, parameters, np.float32(fits["w"]), scans, collection))
+    w = np.array(fits["w"], np.float32)
+    part("landmarks", lambda: _landmarks(prior, trained, parameters, w, scans, collection))
 
 
 def _collection(collection: Path) -> dict:
     """Counts of scenes by split and trait."""
-    result = {}
+    result: dict[str, int | dict[str, int]] = {}
     for split in ("train", "test"):
         entries = shape_measures.manifest_entries(collection, split)
         result[split] = len(entries)
@@ -94,7 +95,8 @@ def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Pat
     fitting = monotonic() - start
     zero = model.field(model.latent("z_sdf", 0 * w[:, 0]))
     zero_points = _surface_points(zero, measures.points)
-    rows, tiles = [], []
+    rows: list[dict] = []
+    tiles: list[tuple[np.ndarray, np.ndarray]] = []
     for k, scan in enumerate(scans):
         fitted = model.field(model.latent("z_sdf", w[:, k]))
         row = {"name": scan.name, "traits": scan.traits, "rms_w": float(np.sqrt(np.mean(w[:, k] ** 2)))}

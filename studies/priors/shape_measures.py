@@ -274,7 +274,8 @@ def random_heads(model: ShapeModel, sigma: float, count: int, seed: int = 0) -> 
     the share of surface points whose |∇f| is within 0.9 and 1.1 (`gradient`), and a picture."""
     rows, tiles = [], []
     for k in range(count):
-        w = sigma * np.random.default_rng([seed, 16, k]).standard_normal(model.bases["z_sdf"].shape[1])
+        normal = np.random.default_rng([seed, 16, k]).standard_normal(size=(model.bases["z_sdf"].shape[1],))
+        w = sigma * normal
         field = model.field(model.latent("z_sdf", w))
         try:
             extracted = extracted_surface(field, VOXEL)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -180,10 +180,10 @@ def evaluation_cost(model: ShapeModel, points: int, repeats: int = 7) -> tuple[f
         dr.eval([dr.grad(v) for v in values.values()])
         dr.sync_thread()
 
-    return tuple(_shortest(f, repeats) / points * 1e6 for f in (forward, backward))
+    return _shortest(forward, repeats) / points * 1e6, _shortest(backward, repeats) / points * 1e6
 
 
-def _shortest(function, repeats: int) -> float:
+def _shortest(function: Callable[[], None], repeats: int) -> float:
     times = []
     for _ in range(repeats + 2):
         start = time.perf_counter()
