@@ -14,6 +14,7 @@ import skimage.data
 
 from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.file import Avatar, save_avatar
+from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LANDMARKS
 from sira_mi.fields.mlp import Architecture, initial_parameters
 from sira_mi.fit.settings import QUALITIES, FitSettings
@@ -127,7 +128,8 @@ def small_avatar(seed: int = 1) -> Avatar:
     sharpness = rng.uniform(2, 20, (SMALL.lobes, 1))
     amplitude = rng.uniform(0.2, 1.0, (SMALL.lobes, 3))
     tensors["lobes"] = np.concatenate([even_directions(SMALL.lobes), sharpness, amplitude], axis=1)
-    return Avatar(SMALL, {name: value.astype(np.float32) for name, value in tensors.items()})
+    tensors = {name: value.astype(np.float32) for name, value in tensors.items()}
+    return Avatar(SMALL, tensors, skin=SkinPrior(radiance=0.286, deviations=(0.6, 0.08)))
 
 
 @pytest.fixture(scope="session")

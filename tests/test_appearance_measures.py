@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from conftest import SMALL, small_avatar
 
-from sira_mi.avatar import skin_tone
 from sira_mi.conventions import HELD_OUT_VIEWS, LANDMARKS, LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import evaluate_in_chunks
@@ -137,9 +136,9 @@ def skin_loss(albedo: np.ndarray, weight: np.ndarray, radiance: float = SETTINGS
     """Of scenes whose landmarks all have the same albedo [S, 3], with landmark weights [S, L]."""
     columns = np.repeat(albedo.T[:, :, None], weight.shape[1], axis=2).reshape(3, -1).astype(np.float32)
     weight = mi.TensorXf(weight.reshape(1, -1).astype(np.float32))
-    level = np.full(len(albedo), skin_tone.SKIN_LUMINANCE * radiance / SETTINGS.skin_radiance)
-    expected = skin_tone.tone_of_luminance(level)
-    loss = skin_tone.skin_tone_loss(mi.TensorXf(columns), weight, expected, SETTINGS.skin_deviations)
+    level = np.full(len(albedo), SETTINGS.skin.luminance * radiance / SETTINGS.skin_radiance)
+    expected = SETTINGS.skin.tone_of_luminance(level)
+    loss = SETTINGS.skin.loss(mi.TensorXf(columns), weight, expected)
     return float(loss.numpy().item())
 
 
@@ -151,7 +150,7 @@ def test_skin_tone_loss_expects_measured_skin():
     """0 at the mean of measured skin, large for blue and for grey skin; scenes without landmarks do not count. The
     skin patches of the ColorChecker lie on the axis: they are expected when the photo is as much brighter or darker."""
     even = np.full((1, 4), 0.25)
-    mean = np.exp(skin_tone.SKIN_TONE_MEAN)
+    mean = np.exp(SETTINGS.skin.mean)
     assert skin_loss(mean[None], even) < 1e-6
     assert skin_loss(mean[None], even, radiance=float("nan")) < 1e-6
     for patch in ([194, 150, 130], [115, 82, 68]):
@@ -172,9 +171,9 @@ def test_skin_radiance_is_that_of_the_observations_near_the_landmarks(scene):
     luminance = (scene.sample_color @ LUMINANCE)[near[scene.sample_point]]
     assert len(luminance) > 1
     expected = np.exp(np.log(luminance).mean())
-    assert skin_tone.skin_radiance(scene, landmarks) == pytest.approx(expected, rel=1e-5)
-    assert np.isnan(skin_tone.skin_radiance(scene, landmarks[:0]))
-    assert np.isnan(skin_tone.skin_radiance(scene, landmarks + 50))
+    assert af_sm.skin_radiance(scene, landmarks) == pytest.approx(expected, rel=1e-5)
+    assert np.isnan(af_sm.skin_radiance(scene, landmarks[:0]))
+    assert np.isnan(af_sm.skin_radiance(scene, landmarks + 50))
 
 
 # A head made by the model
@@ -372,7 +371,7 @@ def test_training_latents_are_those_of_the_prior(model):
     appearance |= {name: 0.5 + random(SMALL.latents[name], scenes, seed=k) for k, name in enumerate(af_sm.LATENTS)}
     shape = {name: model.tensors[name] for name in ("deformation", "reference", "rendering")}
     shape |= {name: random(SMALL.latents[name], scenes, seed=9) for name in ("z_sdf", "z_r")}
-    prior = assemble_prior(SMALL, shape, appearance, np.zeros((1, LANDMARKS, 3)), 0.5, 0)
+    prior = assemble_prior(SMALL, shape, appearance, np.zeros((1, LANDMARKS, 3)), SETTINGS, 0)
     latents = ap.training_latents(appearance)
     for name in af_sm.LATENTS:
         np.testing.assert_allclose(latents[name].mean(axis=1), 0, atol=1e-5)

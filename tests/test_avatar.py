@@ -10,7 +10,8 @@ from conftest import SMALL
 from safetensors.numpy import save
 
 from sira_mi.avatar.architecture import AvatarArchitecture
-from sira_mi.avatar.file import FORMAT, Avatar, load_avatar, save_avatar
+from sira_mi.avatar.file import FORMAT, load_avatar, load_prior, save_avatar
+from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.errors import InputError
 
 
@@ -44,6 +45,18 @@ def test_round_trip(avatar, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+def test_what_a_prior_expects_of_skin_comes_back(avatar, tmp_path):
+    """A file of an earlier version opens without it, but is no prior to fit with."""
+    skin = SkinPrior(radiance=0.3, deviations=(0.5, 0.1), mean=(-1.0, -2.0, -3.0), axis=(0.1, 0.2, 0.7))
+    save_avatar(tmp_path / "a", dataclasses.replace(avatar, skin=skin))
+    assert load_avatar(tmp_path / "a").skin == load_prior(tmp_path / "a").skin == skin
+    save_avatar(tmp_path / "a", dataclasses.replace(avatar, skin=None))
+    assert load_avatar(tmp_path / "a").skin is None
+    with pytest.raises(InputError, match=r"earlier version.*python -m sira_mi\.training appearance") as caught:
+        load_prior(tmp_path / "a")
+    assert "\n" not in str(caught.value)
+
+
 def test_a_refined_light_comes_back_and_may_be_missing(avatar, tmp_path):
     """A prior has none; one of another size is refused."""
     network = avatar.architecture.networks["light_refinement"]
@@ -57,7 +70,7 @@ def test_a_refined_light_comes_back_and_may_be_missing(avatar, tmp_path):
 
 
 def test_the_same_avatar_is_the_same_bytes(avatar, tmp_path):
-    shuffled = Avatar(avatar.architecture, dict(reversed(avatar.tensors.items())))
+    shuffled = dataclasses.replace(avatar, tensors=dict(reversed(avatar.tensors.items())))
     save_avatar(tmp_path / "a", avatar)
     save_avatar(tmp_path / "b", shuffled)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -136,6 +149,12 @@ def test_safetensors_of_another_program(avatar, tmp_path):
         json.dumps(description(k_s=2)),
         json.dumps(description(k_r="much")),
         json.dumps(description(k_r=[1])),
+        json.dumps(description(skin=[1])),
+        json.dumps(description(skin={"radiance": 0.3})),
+        json.dumps(description(skin={"radiance": 0.3, "deviations": [0.6]})),
+        json.dumps(description(skin={"radiance": 0.0, "deviations": [0.6, 0.08]})),
+        json.dumps(description(skin={"radiance": "much", "deviations": [0.6, 0.08]})),
+        json.dumps(description(skin={"radiance": 0.3, "deviations": [0.6, 0.08], "mean": 7})),
         json.dumps({k: v for k, v in description().items() if k != "k_s"}),
         '{"roughness": ' + "9" * 5000 + "}",
     ],

@@ -334,12 +334,12 @@ def test_the_assembled_prior_is_an_avatar(shape, appearance, two_scenes, tmp_pat
 
     landmarks = np.stack([scene.landmarks for scene in two_scenes])
     landmarks[0, 3] = np.nan
-    prior = assemble_prior(SMALL, shape[0], appearance[0], landmarks, 0.5, 0)
+    prior = assemble_prior(SMALL, shape[0], appearance[0], landmarks, APPEARANCE, 0)
     save_avatar(tmp_path / "prior", prior)
     back = load_avatar(tmp_path / "prior")
     for name in SMALL.latents:
         assert (back.tensors[name] == 0).all()
-    assert back.k_r == 0
+    assert back.k_r == 0 and back.roughness == APPEARANCE.roughness and back.skin == APPEARANCE.skin
     np.testing.assert_allclose(back.tensors["landmarks"][5], landmarks[:, 5].mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(back.tensors["landmarks"][3], landmarks[1, 3], atol=1e-6)
     assert np.isnan(back.tensors["landmarks"][100]).all()

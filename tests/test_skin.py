@@ -12,12 +12,12 @@ from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.fit import initial_tensors
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.training.af_sm import AppearanceTraining
 
 SIZE = 128
 EYES = (33, 246, 161, 160, 159, 158, 157, 173, 133, 155, 154, 153, 145, 144, 163, 7)  # around the right one
 LEFT_EYE = (263, 466, 388, 387, 386, 385, 384, 398, 362, 382, 381, 380, 374, 373, 390, 249)
-USUAL = AppearanceTraining().skin_radiance
+PRIOR_HEAD = load_avatar(PRIOR)
+USUAL = PRIOR_HEAD.skin_prior().radiance
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +44,12 @@ def test_exposure_brings_the_skin_to_that_of_the_training(variant, portrait):
     from sira_mi.fit.skin import face_exposure, skin_cues
 
     assert skin_cues(portrait).radiance == pytest.approx(USUAL, rel=1e-5)
-    assert face_exposure(darker(portrait, 4)) == pytest.approx(4, rel=1e-5)
-    assert face_exposure(darker(portrait, 0.8)) == pytest.approx(0.8, rel=1e-5)
-    assert face_exposure(darker(portrait, 1e4)) == 16 and face_exposure(darker(portrait, 0.1)) == 0.5
+    assert face_exposure(darker(portrait, 4), PRIOR_HEAD) == pytest.approx(4, rel=1e-5)
+    assert face_exposure(darker(portrait, 0.8), PRIOR_HEAD) == pytest.approx(0.8, rel=1e-5)
+    assert face_exposure(darker(portrait, 1e4), PRIOR_HEAD) == 16
+    assert face_exposure(darker(portrait, 0.1), PRIOR_HEAD) == 0.5
     for blind in blind_portraits(portrait):
-        assert skin_cues(blind) is None and face_exposure(blind) == 1
+        assert skin_cues(blind) is None and face_exposure(blind, PRIOR_HEAD) == 1
 
 
 def blind_portraits(portrait: Portrait) -> tuple[Portrait, Portrait]:

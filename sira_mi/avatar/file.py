@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
@@ -42,6 +43,16 @@ class Avatar:
     roughness: float = 0.5  # of the specular BRDF, fixed
     k_s: float = 1.0  # weight of the specular BRDF, eq. 8
     k_r: float = 1.0  # weight of the albedo refinement, eq. 11
+    skin: SkinPrior | None = None  # None in files of earlier versions
+
+    def skin_prior(self) -> SkinPrior:
+        """What the prior expects of skin. Raises InputError where the file does not say."""
+        if self.skin is None:
+            raise InputError(
+                "the prior was made by an earlier version, without its constants of skin: run "
+                "`python -m sira_mi.training appearance` again"
+            )
+        return self.skin
 
     def replaced(self, **tensors: np.ndarray) -> "Avatar":
         """The same avatar with some tensors replaced."""
@@ -58,6 +69,8 @@ def save_avatar(path: str | Path, avatar: Avatar) -> None:
         "k_s": avatar.k_s,
         "k_r": avatar.k_r,
     }
+    if avatar.skin is not None:
+        description["skin"] = dataclasses.asdict(avatar.skin)
     tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
     data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
     data = _with_sorted_header(data)
@@ -94,11 +107,26 @@ def load_avatar(path: str | Path | None = None) -> Avatar:
         description = json.loads(metadata["avatar"])
         architecture = AvatarArchitecture.from_dict(description["architecture"], path)
         scalars = {name: float(description[name]) for name in ("roughness", "k_s", "k_r")}
-        avatar = Avatar(architecture, tensors, **scalars)
+        avatar = Avatar(architecture, tensors, **scalars, skin=_read_skin(description.get("skin")))
         _check(avatar)
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged: {error}") from error
     return avatar
+
+
+def _read_skin(stored: dict | None) -> SkinPrior | None:
+    """Raises TypeError or ValueError for anything but the values of a `SkinPrior`."""
+    if stored is None:
+        return None
+    return SkinPrior(**{name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()})
+
+
+def load_prior(path: str | Path | None = None) -> Avatar:
+    """`load_avatar` for a prior to fit with. Raises InputError for one of an earlier version, which does not say what
+    it expects of skin, too."""
+    prior = load_avatar(path)
+    prior.skin_prior()
+    return prior
 
 
 def _check(avatar: Avatar) -> None:

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 import sira_mi
-from sira_mi.avatar.file import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_avatar, save_avatar
+from sira_mi.avatar.file import LANDMARK_MODEL, OPTIONAL, PRIOR, Avatar, load_prior, save_avatar
 from sira_mi.decisions import Plan, explain
 from sira_mi.errors import InputError
 from sira_mi.export.mesh import write_mesh
@@ -86,7 +86,7 @@ def fit_photo(request: FitRequest) -> int:
         settings = replace(settings, stages=(*settings.stages, polish_stage()))
     plan = plan_fit(settings).keep_all() if request.keep_all else plan_fit(settings)
     prior_path = request.prior or PRIOR
-    prior = load_avatar(prior_path)
+    prior = load_prior(prior_path)
     portrait = read_portrait(request, settings, prior)
     for note in portrait.notes:
         print(f"note: {note}", file=sys.stderr)
@@ -159,7 +159,7 @@ def fit_portrait(
 ) -> None:
     """Runs the stages of `settings` from where `progress` stands, which follows; `work` is a folder for files in
     between, `plan` what is left out (default: that of `plan_fit`). Raises InputError when the fit diverges."""
-    problems = stage_problems(portrait, load_avatar(prior_path), prior_path, work, settings, plan)
+    problems = stage_problems(portrait, load_prior(prior_path), prior_path, work, settings, plan)
     run_stages([(problems[kind], stage) for kind, stage in settings.stages], progress, settings.block, seed, checkpoint)
 
 

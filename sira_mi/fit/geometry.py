@@ -43,7 +43,7 @@ class GeometryProblem:
         self.head.remesh_every = 1 << 30
         mask = np.where(self.valid, portrait.mask, 0)
         # An untrained rendering function expects no exposure.
-        self.exposure = face_exposure(portrait) if settings.learned_radiance else 1.0
+        self.exposure = face_exposure(portrait, avatar) if settings.learned_radiance else 1.0
         self.target = np.concatenate([self.exposure * portrait.image, mask[..., None]], axis=-1).astype(np.float32)
         self.landmarks = self._landmarks(avatar)
 

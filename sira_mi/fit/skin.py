@@ -19,12 +19,10 @@ from scipy.special import expit, softmax
 from skimage.draw import polygon2mask
 
 from sira_mi.avatar.file import Avatar
-from sira_mi.avatar.skin_tone import skin_tone_loss, tone_of_luminance
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fit.shaded import SeenPoints, base_albedo
 from sira_mi.portrait.landmarks import BARE_SKIN, BELOW_EYES, EYES
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.training.af_sm import AppearanceTraining
 
 # Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
 _REACH = 0.04
@@ -137,11 +135,11 @@ def _eyes(portrait: Portrait) -> tuple[Eye, ...]:
     return tuple(seen)
 
 
-def face_exposure(portrait: Portrait) -> float:
-    """The factor that brings the skin of a photo to the luminance that skin has in the photos of the training; 1 where
-    no skin is seen."""
+def face_exposure(portrait: Portrait, prior: Avatar) -> float:
+    """The factor that brings the skin of a photo to the luminance that skin has in the photos of the prior's training;
+    1 where no skin is seen."""
     cues = skin_cues(portrait)
-    return 1.0 if cues is None else float(np.clip(AppearanceTraining().skin_radiance / cues.radiance, *_EXPOSURES))
+    return 1.0 if cues is None else float(np.clip(prior.skin_prior().radiance / cues.radiance, *_EXPOSURES))
 
 
 def skin_luminance(cues: SkinCues) -> float:
@@ -165,12 +163,12 @@ class SkinPatches:
     luminance: float
 
     def loss(self, avatar: Avatar, tensors: dict):
-        """`skin_tone_loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
+        """`SkinPrior.loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
         count = len(self.points.row)
         albedo = base_albedo(avatar, tensors, self.points)
         weight = mi.TensorXf(np.full((1, count), 1 / count, np.float32))
-        expected = tone_of_luminance(np.array([self.luminance]))
-        return skin_tone_loss(albedo, weight, expected, AppearanceTraining().skin_deviations)
+        skin = avatar.skin_prior()
+        return skin.loss(albedo, weight, skin.tone_of_luminance(np.array([self.luminance])))
 
 
 def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:

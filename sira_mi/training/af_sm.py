@@ -15,7 +15,7 @@ import numpy as np
 from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.decoders import SKIN_SPECULAR, diffuse_albedo, illumination, specular_albedo
 from sira_mi.avatar.shape import HeadShape
-from sira_mi.avatar.skin_tone import SKIN_LUMINANCE, skin_tone_loss, tone_of_luminance
+from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.columns import evaluate_in_chunks, in_three
 from sira_mi.fields.mlp import initial_parameters, layers
@@ -54,6 +54,11 @@ class AppearanceTraining:
     skin_radiance: float = 0.286  # luminance of average skin in a photo: the geometric mean of the collection's photos
     skin_deviations: tuple[float, float] = (0.6, 0.08)  # of log skin albedo along and across the axis of skin tone:
     # half a stop from the tone that the photo's brightness tells, and Yun et al. 2010
+
+    @property
+    def skin(self) -> SkinPrior:
+        """What the prior will expect of skin."""
+        return SkinPrior(self.skin_radiance, self.skin_deviations)
 
 
 @dataclass(frozen=True)
@@ -193,14 +198,8 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
         "smoothness": losses.mean(dr.abs(difference)),
         "specular_anchor": losses.mean(anchor * anchor),
         "white_light": losses.mean(grey * grey),
-        "skin_tone": skin_tone_loss(skin, batch.skin_weight, expected_skin(settings, batch), settings.skin_deviations),
+        "skin_tone": settings.skin.loss(skin, batch.skin_weight, settings.skin.tone_in_photo(batch.skin_radiance)),
     }
-
-
-def expected_skin(settings: AppearanceTraining, batch: AppearanceBatch) -> np.ndarray:
-    """Log linear RGB [3, S] of the skin that is expected in each scene. Its photos are taken to be exposed for the
-    light: skin that is brighter in them than usual is lighter by as much."""
-    return tone_of_luminance(SKIN_LUMINANCE * batch.skin_radiance / settings.skin_radiance)
 
 
 def weighted_sum(terms: dict, settings: AppearanceTraining):

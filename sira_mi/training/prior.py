@@ -48,12 +48,13 @@ def assemble_prior(
     shape: dict[str, np.ndarray],
     appearance: dict[str, np.ndarray],
     landmarks: np.ndarray,
-    roughness: float,
+    settings: af_sm.AppearanceTraining,
     seed: int,
 ) -> Avatar:
     """The mean head of both trained models. All latents become standard normal: the zero latent is the mean of the
     trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement
-    starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes that have them."""
+    starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes that have them.
+    Roughness and the prior on skin are those of the appearance's `settings`."""
     owners = {
         "z_sdf": "deformation",
         "z_r": "rendering",
@@ -76,4 +77,5 @@ def assemble_prior(
         counts = np.isfinite(landmarks[:, :, :1]).sum(axis=0)
         mean = np.nansum(landmarks, axis=0) / np.maximum(counts, 1)
     tensors["landmarks"] = np.where(counts > 0, mean, np.nan).astype(np.float32)
-    return Avatar(architecture, {k: v.astype(np.float32) for k, v in tensors.items()}, roughness=roughness, k_r=0.0)
+    tensors = {name: value.astype(np.float32) for name, value in tensors.items()}
+    return Avatar(architecture, tensors, roughness=settings.roughness, k_r=0.0, skin=settings.skin)

@@ -210,6 +210,4 @@ def train_appearance(
         picture_steps=picture_steps,
     )
     landmarks = np.stack([scene.landmarks for scene in scenes])
-    save_avatar(
-        out / "prior.safetensors", assemble_prior(architecture, shape, appearance, landmarks, settings.roughness, seed)
-    )
+    save_avatar(out / "prior.safetensors", assemble_prior(architecture, shape, appearance, landmarks, settings, seed))

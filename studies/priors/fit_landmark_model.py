@@ -2,7 +2,7 @@
 `sira_mi.avatar.landmark_model`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -30,7 +30,7 @@ class Places:
 def without_landmark_model(prior: Avatar) -> Avatar:
     """The prior without a model of landmarks."""
     kept = {name: values for name, values in prior.tensors.items() if name not in LANDMARK_MODEL}
-    return Avatar(prior.architecture, kept, prior.roughness, prior.k_s, prior.k_r)
+    return replace(prior, tensors=kept)
 
 
 def place_landmarks(prior: Avatar, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None) -> Places:
