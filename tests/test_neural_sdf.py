@@ -206,7 +206,7 @@ def test_a_new_extraction_changes_the_picture_as_the_derivative_says(avatar, ava
 
 @pytest.mark.slow
 def test_sixty_updates_leave_no_memory_behind(avatar, avatar_path):
-    """The full 500 are in studies/numerics/remesh_updates.py."""
+    """The full 500 are in `python -m studies.numerics.remesh_updates`."""
     scene = build(avatar_path, camera(18), voxel=0.25)
     params = mi.traverse(scene)
     rng = np.random.default_rng(0)

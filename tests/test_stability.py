@@ -1,6 +1,7 @@
 """Every row of `docs/stability.md` but those of fits, with fewer cases: errors in single precision within bounds,
 everything finite. A row can fail, the page says so, and it is made of its data alone."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -39,10 +40,14 @@ def test_measures_notice_what_is_wrong():
     assert largest(np.array([1.0, np.nan])) == np.inf
     assert relative_error(np.array([1.0, 5.0]), np.array([1.0, 1e-9]), 1.0) == 0.0
     assert relative_error(np.array([1.1]), np.array([1.0]), 1.0) == pytest.approx(0.1)
-    good = {"name": "a", "unit": "b", "cases": 1, "error": 0.5, "bound": 1.0, "non_finite": 0}
-    assert Row(**good).passed and Row(**good, gradients_finite=True).passed
-    for fault in ({"error": 2.0}, {"error": np.nan}, {"non_finite": 1}, {"gradients_finite": False}):
-        row = Row(**{**good, **fault})
+    good = Row("a", "b", cases=1, error=0.5, bound=1.0, non_finite=0)
+    assert good.passed and replace(good, gradients_finite=True).passed
+    for row in (
+        replace(good, error=2.0),
+        replace(good, error=np.nan),
+        replace(good, non_finite=1),
+        replace(good, gradients_finite=False),
+    ):
         assert not row.passed
         page = fill_template({"sampling": Measured(True, (row,))})
         assert "missed**" in page and "| rows that miss theirs | a (b) |" in page

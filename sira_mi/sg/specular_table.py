@@ -12,7 +12,7 @@ g(h) = h / (h (1 − k) + k), k = (r + 1)²/8, the masking.
 - ACROSS: log of the additional sharpness across the plane of incidence, per |n × v|², over Λ/(8 h²);
 - HALF_POINT: log of the light's sharpness at which the true shape of f^s counts a quarter, over Λ/4.
 
-The constants are made by `python studies/numerics/fit_specular_table.py --write`.
+The constants are made by `python -m studies.numerics.fit_specular_table --write`.
 """
 
 TERMS = 7, 6

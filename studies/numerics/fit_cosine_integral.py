@@ -1,5 +1,4 @@
-"""Fits the three polynomials of `sira_mi/sg/integrals.py` to quadrature:
-`python -m studies.numerics.fit_cosine_integral`.
+"""Fits the polynomials of `sira_mi/sg/integrals.py` to quadrature: `python -m studies.numerics.fit_cosine_integral`.
 
 Prints `_COSINE_DEVIATION`, `_STEP_RATIO` and `_TAIL` as source, and the errors of the forms in float64. With `--check`
 it compares them with the constants of the package and ends with 1 if they differ by more than the tolerances below.
@@ -114,7 +113,7 @@ def fit_cosine(sharpness, cosine, clamped, peak) -> tuple[np.ndarray, float]:
     deviation = np.sqrt(variance * ratio)
     matrix = basis(cosine, sharpness, COSINE_TERMS, COSINE_HALF_POINT)
     weight = normal_density(mean / deviation) * deviation / (2.0 * ratio * scale) + 1e-9
-    best, solution = np.inf, None
+    best, solution = np.inf, np.zeros(matrix.shape[1])
     for _ in range(COSINE_ITERATIONS):
         trial = weighted_solution(matrix, ratio, weight)
         fitted = matrix @ trial

@@ -1,4 +1,4 @@
-"""Computes the tables of `sira_mi/sg/specular_table.py`: `python studies/numerics/fit_specular_table.py [--write]`.
+"""Computes the tables of `sira_mi/sg/specular_table.py`: `python -m studies.numerics.fit_specular_table`.
 
 The closed form of `sira_mi/sg/specular.py` is evaluated in double precision and compared with quadrature for views from
 5° to 89.9°, roughnesses from 0.1 to 1, lights of sharpness 0.5 to 10⁵ and the light directions of
@@ -7,7 +7,7 @@ the others are fitted together to the radiance for specular albedos of 0.03 and 
 largest value over the light directions and to an allowance, which is 1 up to 70° and grows beyond. The sum of the
 errors' squares, then of their fourth and sixth powers is minimised by Levenberg and Marquardt's method.
 
-Without an option the tables are printed; `--write` puts them into the package's file; `--check` compares them with the
+Prints the tables; `--write` puts them into the package's file; `--check` compares them with the
 package's and ends with 1 if the results of the closed form differ by more than the tolerance below.
 """
 

@@ -1,11 +1,11 @@
-"""Errors of closed-form shading under a spherical Gaussian, and its speed: `python studies/numerics/sg_accuracy.py`.
+"""Errors of closed-form shading under a spherical Gaussian, and its speed: `python -m studies.numerics.sg_accuracy`.
 
-The closed forms of `sira_mi/sg/shading.py` run in single precision; the quadrature runs in double, with f^s written
-anew. Each cell is the largest error over 96 light directions relative to the largest value: PhySG's form (with this
-project's cosine integral, so that the error of PhySG's two-term cosine is not in it), then this project's. Half of the
-directions are spread over the sphere, the other half are reflections about half vectors that follow the normal
-distribution, so that lights narrower than the reflectance meet it. A second, denser grid of views, roughnesses and
-sharpnesses, with the quadrature of `specular_quadrature.py`, gives the range within which an error is promised.
+Prints four tables: the specular errors on a dense grid of views, roughnesses and sharpnesses with the largest error of
+each promised range; the specular errors of PhySG's form and of this project's; the errors of the irradiance; and the
+time of `shade`. The closed forms of `sira_mi/sg/shading.py` run in single precision, the quadrature in double. An error
+is the largest over light directions, relative to the largest value. PhySG's form has this project's cosine integral, so
+that the error of its two-term cosine does not count. Half of the light directions are spread over the sphere; the
+others are reflections about half vectors that follow the normal distribution, so that narrow lights meet the lobe.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from studies.numerics.fit_cosine_integral import hemisphere_quadrature
-from studies.numerics.specular_quadrature import grid_integrals, views
+from studies.numerics.specular_quadrature import grid_integrals, integrals, views
 
 SHARPNESSES = (1e-3, 0.3, 5.0, 30.0, 200.0, 1e3, 1e5)
 TABULATED_ROUGHNESS = 0.1  # the closed form's tables begin here
@@ -37,69 +37,6 @@ PROMISED = ((70, 5.0), (85, 15.0))
 TIMED_POINTS, TIMED_LOBES = 2**17, (1, 64)
 
 
-def polar_offsets(sharpness: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions [Q, 3] around +z and weights [Q] that sum to ∫ exp(λ(z − 1)) dω over the hemisphere around +z.
-
-    x = λ(1 − z) = t² by Gauss-Legendre up to 36 (exp(−36) is 2e-16) or the equator, azimuth by the midpoint rule."""
-    x, weight = np.polynomial.legendre.leggauss(nodes)
-    limit = np.sqrt(min(sharpness, 36.0))
-    t = 0.5 * (x + 1.0) * limit
-    gap = t * t / sharpness
-    azimuth = (np.arange(2 * nodes) + 0.5) / nodes * np.pi
-    sine = np.sqrt(gap * (2.0 - gap))[:, None]
-    offsets = [sine * np.cos(azimuth), sine * np.sin(azimuth), np.repeat(1.0 - gap[:, None], 2 * nodes, axis=1)]
-    ring = np.exp(-t * t) * 2.0 * t * 0.5 * weight * limit / sharpness * np.pi / nodes
-    return np.stack(offsets, axis=-1).reshape(-1, 3), np.repeat(ring, 2 * nodes)
-
-
-def frame(axis: np.ndarray) -> np.ndarray:
-    """Rows are an orthonormal basis whose third vector is the unit `axis` [3]."""
-    other = np.eye(3)[np.argmin(np.abs(axis))]
-    tangent = np.cross(axis, other)
-    tangent /= np.linalg.norm(tangent)
-    return np.stack([tangent, np.cross(axis, tangent), axis])
-
-
-def reflectance(light: np.ndarray, view: np.ndarray, roughness: float) -> np.ndarray:
-    """f^s (ω·n)₊ for n = z and light directions [Q, 3], as its parts [2, Q] for F = 1 and F = P."""
-    half = light + view
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    cos_light, cos_view, cos_half = light[:, 2], view[2], half @ view
-    gap = 0.5 * ((half - (0.0, 0.0, 1.0)) ** 2).sum(axis=1)
-    density = np.exp(-2.0 / roughness**4 * gap) / (np.pi * roughness**4)
-    k = (roughness + 1.0) ** 2 / 8.0
-    # G = g(n·l) g(n·v) over (n·l)(n·v) of the denominator; at the horizon only the quotient is finite.
-    masking = 1.0 / ((np.maximum(cos_light, 0.0) * (1.0 - k) + k) * (cos_view * (1.0 - k) + k))
-    white = 0.25 * density * masking * np.maximum(cos_light, 0.0)
-    return np.stack([white, white * 2.0 ** (-(5.55473 * cos_half + 6.8316) * cos_half)])
-
-
-def quadrature(view: np.ndarray, roughness: float, sharpness: float, axes: np.ndarray, nodes: int) -> np.ndarray:
-    """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ dω for n = z and axes [D, 3], as its parts [2, D] for F = 1 and F = P.
-
-    The nodes follow the sharper of the two factors: the light, or the normal distribution by the half vector."""
-    distribution = 2.0 / roughness**4
-    if sharpness > distribution:
-        # The nodes reach over the hemisphere around the light's axis; of a broad light the other one counts too.
-        offsets, weight = polar_offsets(sharpness, nodes)
-        far = weight * np.exp(-2.0 * sharpness * offsets[:, 2])
-        sums = []
-        for axis in axes:
-            light = offsets @ frame(axis)
-            sums.append(reflectance(light, view, roughness) @ weight)
-            if sharpness < 36.0:
-                sums[-1] = sums[-1] + reflectance(light - 2.0 * offsets[:, 2:] * axis, view, roughness) @ far
-        return np.array(sums).T
-    half, weight = polar_offsets(distribution, nodes)
-    cosine = half @ view
-    half, weight, cosine = half[cosine > 0.0], weight[cosine > 0.0], cosine[cosine > 0.0]
-    light = 2.0 * cosine[:, None] * half - view
-    # The nodes' weights contain D up to its norm and dω = 4 (v·h) dh; f^s without D is left.
-    gap = 1.0 - half[:, 2]
-    rest = reflectance(light, view, roughness) * np.exp(distribution * gap) * 4.0 * cosine * weight
-    return np.stack([rest @ np.exp(-sharpness * (1.0 - light @ axis)) for axis in axes], axis=1)
-
-
 def light_directions(view: np.ndarray, roughness: float) -> np.ndarray:
     """Axes [D, 3]: a Fibonacci lattice, and `view` reflected about a spiral of half vectors that follow D."""
     from sira_mi.fields.directions import GOLDEN_ANGLE, fibonacci_directions
@@ -114,12 +51,12 @@ def light_directions(view: np.ndarray, roughness: float) -> np.ndarray:
     return np.concatenate([fibonacci_directions(DIRECTIONS - count), reflected])
 
 
-def closed_form(function, view, roughness, albedo, sharpness, axes) -> np.ndarray:
+def evaluate_closed_form(function, view, roughness, albedo, sharpness, axes) -> np.ndarray:
     """The closed form `function` for n = z and axes [D, 3]: [D]."""
     ones = dr.ones(mi.Float, len(axes))
     value = function(
-        mi.Vector3f(0, 0, 1) * ones,
-        mi.Vector3f(*(float(x) for x in view)) * ones,
+        mi.Vector3f(0.0, 0.0, ones),
+        mi.Vector3f(*(float(x) * ones for x in view)),
         mi.Float(albedo) * ones,
         dr.opaque(mi.Float, roughness, len(axes)),
         mi.Vector3f(np.ascontiguousarray(axes.T)),
@@ -129,26 +66,27 @@ def closed_form(function, view, roughness, albedo, sharpness, axes) -> np.ndarra
     return value.x.numpy().astype(np.float64)
 
 
-def specular_table(nodes: int) -> None:
+def print_specular_table(nodes: int) -> None:
     """Prints the errors of the specular closed forms."""
     from sira_mi.sg import shading
 
     print("\nSpecular: largest error over light directions, % of the largest value, PhySG → this project")
     print("| roughness | albedo | view | " + " | ".join(f"λ = {x:g}" for x in SHARPNESSES) + " |")
     print("|---" * (3 + len(SHARPNESSES)) + "|")
-    worst = {}
+    worst: dict[tuple[float, float], np.ndarray] = {}
     for roughness in ROUGHNESSES:
-        rows = {albedo: [] for albedo in ALBEDOS}
+        rows: dict[float, list[str]] = {albedo: [] for albedo in ALBEDOS}
         for angle in VIEW_ANGLES:
             view = np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
             axes = light_directions(view, roughness)
-            cells = {albedo: [] for albedo in ALBEDOS}
+            same = np.ones(DIRECTIONS)
+            cells: dict[float, list[str]] = {albedo: [] for albedo in ALBEDOS}
             for sharpness in SHARPNESSES:
-                white, grazing = quadrature(view, roughness, sharpness, axes, nodes)
+                white, grazing = integrals(view[2] * same, roughness * same, sharpness * same, axes, nodes)
                 for albedo in ALBEDOS:
                     exact = albedo * white + (1.0 - albedo) * grazing
                     errors = [
-                        100.0 * np.abs(closed_form(f, view, roughness, albedo, sharpness, axes) - exact).max()
+                        100.0 * np.abs(evaluate_closed_form(f, view, roughness, albedo, sharpness, axes) - exact).max()
                         for f in (shading.specular_radiance_physg, shading.specular_radiance)
                     ]
                     physg, ours = (error / exact.max() for error in errors)
@@ -160,11 +98,11 @@ def specular_table(nodes: int) -> None:
         for albedo in ALBEDOS:
             print("\n".join(rows[albedo]), flush=True)
     for angle in VIEW_ANGLES:
-        cells = ("{:.1f} → {:.1f}".format(*worst[angle, sharpness]) for sharpness in SHARPNESSES)
-        print(f"| worst of {TABULATED_ROUGHNESS:g} to 1 | | {angle}° | " + " | ".join(cells) + " |")
+        last = ("{:.1f} → {:.1f}".format(*worst[angle, sharpness]) for sharpness in SHARPNESSES)
+        print(f"| worst of {TABULATED_ROUGHNESS:g} to 1 | | {angle}° | " + " | ".join(last) + " |")
 
 
-def dense_errors(angles, roughnesses, sharpnesses, nodes: int) -> np.ndarray:
+def measure_dense_errors(angles, roughnesses, sharpnesses, nodes: int) -> np.ndarray:
     """Largest errors of this project's form over light directions, as shares of the largest value: views in degrees ×
     roughnesses × sharpnesses × `DENSE_ALBEDOS`."""
     from sira_mi.sg import specular
@@ -189,9 +127,9 @@ def dense_errors(angles, roughnesses, sharpnesses, nodes: int) -> np.ndarray:
     return np.stack(errors, axis=-1)
 
 
-def range_table(nodes: int) -> None:
+def print_range_table(nodes: int) -> None:
     """Prints the errors on the dense grid and the largest within the promised ranges."""
-    errors = 100.0 * dense_errors(DENSE_VIEW_ANGLES, DENSE_ROUGHNESSES, DENSE_SHARPNESSES, nodes)
+    errors = 100.0 * measure_dense_errors(DENSE_VIEW_ANGLES, DENSE_ROUGHNESSES, DENSE_SHARPNESSES, nodes)
     names = ", ".join(f"{x:g}" for x in DENSE_ALBEDOS)
     print(f"\nSpecular, dense: largest error over λ = 2 to 2000 ({len(DENSE_SHARPNESSES)} values), albedos {names} and")
     print("light directions, % of the largest value over these")
@@ -204,9 +142,9 @@ def range_table(nodes: int) -> None:
         print(f"\nViews to {angle}°: at most {largest:.2f}% (promised: {promised:g}%)")
 
 
-def diffuse_table() -> None:
+def print_diffuse_table() -> None:
     """Prints the errors of the irradiance, which PhySG takes from two more Gaussians and this project does not."""
-    from sira_mi.sg import integrals
+    from sira_mi.sg.integrals import cosine_integral
 
     print("\nDiffuse: error of the irradiance over light angles 0° to 180° (181 of them)")
     print("| λ | % of the value at 0° | % of the value itself, light above the horizon |")
@@ -214,12 +152,12 @@ def diffuse_table() -> None:
     cosine = np.cos(np.radians(np.arange(181.0)))
     for sharpness in SHARPNESSES:
         exact = np.array([hemisphere_quadrature(sharpness, c, 1) for c in cosine])
-        value = integrals.cosine_integral(mi.Float(cosine), dr.opaque(mi.Float, sharpness, 181)).numpy()
+        value = cosine_integral(mi.Float(cosine), dr.opaque(mi.Float, sharpness, 181)).numpy()
         error = 100.0 * np.abs(value - exact)
         print(f"| {sharpness:g} | {error.max() / exact[0]:.3f} | {(error[:91] / exact[:91]).max():.3f} |")
 
 
-def timing_table() -> None:
+def print_timing_table() -> None:
     """Prints the time of `shade`, forward and with its gradients, the kernels compiled before."""
     from sira_mi.sg import lobes, shading
 
@@ -234,8 +172,8 @@ def timing_table() -> None:
     for count in TIMED_LOBES:
         forward, both = [], []
         for _ in range(5):
-            inputs = mi.Vector3f(normal), mi.Vector3f(view), mi.Float(albedo), mi.Float(roughness)
-            inputs += (mi.TensorXf(lobes.initial_lobes(count)),)
+            point = mi.Vector3f(normal), mi.Vector3f(view), mi.Float(albedo), mi.Float(roughness)
+            inputs = (*point, mi.TensorXf(lobes.initial_lobes(count)))
             dr.eval(inputs)
             dr.sync_thread()
             start = time.perf_counter()
@@ -260,10 +198,10 @@ def main() -> None:
     parser.add_argument("--variant", default="llvm_ad_rgb")
     arguments = parser.parse_args()
     mi.set_variant(arguments.variant)
-    range_table(arguments.nodes // 2)
-    specular_table(arguments.nodes)
-    diffuse_table()
-    timing_table()
+    print_range_table(arguments.nodes // 2)
+    print_specular_table(arguments.nodes)
+    print_diffuse_table()
+    print_timing_table()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ dω by quadrature in double precision, many integrals in one launch, with f^s of
-`sira_mi/sg/brdf.py` written anew. The nodes follow the sharper of the two factors."""
+`sira_mi/sg/brdf.py` written anew; `fit_specular_table` and `sg_accuracy` use it. The nodes follow the sharper of the
+two factors."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
@@ -47,7 +48,7 @@ def _radial_node(index, sharpness, nodes, weights):
 
 def _launch(view_cosine, roughness, sharpness, axes, nodes, follow_light):
     x, weights = np.polynomial.legendre.leggauss(nodes)
-    x, weights = Float64(0.5 * (x + 1.0)), Float64(0.5 * weights)
+    radius_nodes, radius_weights = Float64(0.5 * (x + 1.0)), Float64(0.5 * weights)
     lane = dr.arange(UInt32, len(sharpness) * LANES)
     item, part = lane // LANES, lane % LANES
     c, r, lobe = (dr.gather(Float64, Float64(v), item) for v in (view_cosine, roughness, sharpness))
@@ -90,7 +91,9 @@ def _launch(view_cosine, roughness, sharpness, axes, nodes, follow_light):
 
     def body(index, white, grazing):
         node = index * LANES + part
-        gap, weight = _radial_node(node // (2 * nodes), lobe if follow_light else distribution, x, weights)
+        gap, weight = _radial_node(
+            node // (2 * nodes), lobe if follow_light else distribution, radius_nodes, radius_weights
+        )
         azimuth = (Float64(node % (2 * nodes)) + 0.5) * (math.pi / nodes)
         sin_phi, cos_phi = dr.sincos(azimuth)
         radius = dr.sqrt(gap * (2.0 - gap))
@@ -115,8 +118,8 @@ def integrals(
         chosen = np.flatnonzero(follow_light == flag)
         for part in np.split(chosen, range(LAUNCH, len(chosen), LAUNCH)):
             if len(part):
-                arguments = (v[part] for v in (view_cosine, roughness, sharpness, axes))
-                result[:, part] = _launch(*arguments, nodes, flag)
+                point = view_cosine[part], roughness[part]
+                result[:, part] = _launch(*point, sharpness[part], axes[part], nodes, flag)
     return result
 
 

@@ -1,4 +1,4 @@
-"""How fast the shape model trains: `python studies/numerics/training_step.py [--width 96] [--points 4096]`.
+"""How fast the shape model trains: `python -m studies.numerics.training_step [--width 96]`.
 
 Times one SA-SM training step on random scenes, counts its multiplications, and compares the rate with NumPy's matrix
 product of the hidden layers' shape in the same run (the practical ceiling), forward and in the two transposed forms

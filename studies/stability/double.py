@@ -19,7 +19,7 @@ import numpy as np
 
 def types_in_double() -> types.SimpleNamespace:
     """Double-precision counterparts of the current variant's array types, by Mitsuba's names."""
-    arrays = dr.cuda.ad if mi.variant().startswith("cuda") else dr.llvm.ad
+    arrays = dr.cuda.ad if str(mi.variant()).startswith("cuda") else dr.llvm.ad
     return types.SimpleNamespace(
         Float=arrays.Float64,
         Vector3f=arrays.Array3f64,

@@ -52,11 +52,11 @@ class Field64:
         """The same numbers in float64; of a field that stays where it is."""
         if field.motion is not None:
             raise ValueError("the reference in float64 is of fields without a motion")
-        layers = [
-            [tuple(np.array(part.numpy(), np.float64) for part in layer) for layer in network]
-            for network in (field.deformation, field.reference)
-        ]
-        return Field64(*layers, field.octaves)
+
+        def convert(network):
+            return [(np.array(w.numpy(), np.float64), np.array(b.numpy(), np.float64)) for w, b in network]
+
+        return Field64(convert(field.deformation), convert(field.reference), field.octaves)
 
     def _evaluate(self, x, tangents):
         h, t = _network(self.deformation, *_encoded(x, tangents, self.octaves))

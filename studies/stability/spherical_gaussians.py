@@ -251,7 +251,7 @@ def measure_reflectance(quick: bool) -> Row:
     rng, count = np.random.default_rng(8), _count(quick)
     normal, view, light, roughness = _brdf_points(rng, count)
     albedo = single(rng.integers(0, 3, count) / 2.0)
-    inputs = (*(mi.Vector3f(x) for x in (normal, view, light)), mi.Float(albedo), mi.Float(roughness))
+    inputs = mi.Vector3f(normal), mi.Vector3f(view), mi.Vector3f(light), mi.Float(albedo), mi.Float(roughness)
     result = brdf.specular_brdf(*inputs).numpy()
     n = cases.normalise(normal)
     cos_view, cos_light = (n * view).sum(axis=0), (n * light).sum(axis=0)
@@ -275,13 +275,16 @@ def measure_reflectance(quick: bool) -> Row:
     )
 
 
-def _specular(types, normal, view, albedo, roughness, axis, sharpness):
-    vector, scalar = types.Vector3f, types.Float
+def _specular(types, point: tuple[np.ndarray, ...], axis, sharpness):
+    """`specular_radiance` at points (normal, view, albedo, roughness) in the precision of `types`."""
+    normal, view, albedo, roughness = point
     return shading.specular_radiance(
-        *(vector(x) for x in (normal, view)),
-        *(scalar(x) for x in (albedo, roughness)),
-        vector(axis),
-        scalar(sharpness),
+        types.Vector3f(normal),
+        types.Vector3f(view),
+        types.Float(albedo),
+        types.Float(roughness),
+        types.Vector3f(axis),
+        types.Float(sharpness),
         types.Color3f(1.0),
     ).x
 
@@ -298,7 +301,7 @@ def measure_glossy_lobe(quick: bool) -> Row:
     view = cases.draw_views(rng, normal, 1e-4)
     albedo, sharpness = single(rng.integers(0, 2, points)), cases.draw_sharpnesses(rng, points)
     mirror = 2.0 * (normal * view).sum(axis=0) * normal - view
-    point = [np.repeat(x, lights, axis=-1) for x in (normal, view, albedo, roughness)]
+    point = tuple(np.repeat(x, lights, axis=-1) for x in (normal, view, albedo, roughness))
     width = np.repeat(roughness**2 + 1.0 / np.sqrt(sharpness + 1.0), lights)
     every_sharpness = np.repeat(sharpness, lights)
     best, results, exacts = mirror, [], []
@@ -308,9 +311,9 @@ def measure_glossy_lobe(quick: bool) -> Row:
         axis = cases.tilt(rng, np.repeat(best, lights, axis=-1), angle)
         anywhere = rng.random(count) < 0.3
         axis[:, anywhere] = cases.draw_directions(rng, int(anywhere.sum()))
-        results.append(_specular(mi, *point, axis, every_sharpness).numpy().reshape(points, lights))
+        results.append(_specular(mi, point, axis, every_sharpness).numpy().reshape(points, lights))
         with in_double() as double:
-            exacts.append(_specular(double, *point, axis, every_sharpness).numpy().reshape(points, lights))
+            exacts.append(_specular(double, point, axis, every_sharpness).numpy().reshape(points, lights))
         best = axis.reshape(3, points, lights)[:, np.arange(points), exacts[-1].argmax(axis=1)]
     result, exact = np.concatenate(results, axis=1), np.concatenate(exacts, axis=1)
     peak = exact.max(axis=1, keepdims=True)
@@ -348,15 +351,14 @@ def measure_shading(quick: bool) -> Row:
         tensor = mi.TensorXf(lights.astype(np.float32))
         inputs = mi.Vector3f(normal), mi.Vector3f(view), mi.Float(albedo), mi.Float(roughness), tensor
         irradiance, specular = (x.numpy() for x in shading.shade(*inputs))
-        many = [np.repeat(x, count, axis=-1) for x in (normal, view, albedo)]
+        every_normal, *others = (np.repeat(x, count, axis=-1) for x in (normal, view, albedo))
+        point = (every_normal, *others, np.full(points * count, roughness))
         axis, sharpness, amplitude = (np.tile(x, (1, points)) for x in (lights[:, :3].T, lights[:, 3], lights[:, 4:].T))
         with in_double() as double:
             exact_irradiance = integrals.cosine_integral(
-                double.Float((many[0] * axis).sum(axis=0)), double.Float(sharpness.ravel())
+                double.Float((every_normal * axis).sum(axis=0)), double.Float(sharpness.ravel())
             ).numpy()
-            exact_specular = _specular(
-                double, *many, np.full(points * count, roughness), axis, sharpness.ravel()
-            ).numpy()
+            exact_specular = _specular(double, point, axis, sharpness.ravel()).numpy()
         for result, exact in ((irradiance, exact_irradiance), (specular, exact_specular)):
             sums = (amplitude * exact).reshape(3, points, count).sum(axis=2)
             error = max(error, peak_error(result, sums, sums.max(axis=1, keepdims=True)))

@@ -23,6 +23,7 @@ from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.mlp import SOFTPLUS_SHARPNESS
 from sira_mi.fields.sdf import SdfField
 from studies.stability import cases
+from studies.stability.double import single
 from studies.stability.fields64 import Field64, box_interval
 from studies.stability.rows import Row, count_non_finite, largest
 
@@ -75,7 +76,7 @@ def _head(scene):
 
 
 def _round_rays(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(np.ascontiguousarray(a, np.float32).astype(np.float64) for a in (origin, cases.normalise(direction)))
+    return single(origin), single(cases.normalise(direction))
 
 
 def draw_camera_rays(rng: np.random.Generator, count: int, distance: float, degrees: float):
@@ -244,12 +245,13 @@ def measure_wrong_surfaces(quick: bool) -> Row:
     chord's height: the bound is 0.5% on the 5 mm grid, 2% on the 20 mm grid of the quick version."""
     scene, rng, count = _scene(quick), np.random.default_rng(36), _count(quick)
     rays = [draw_camera_rays(rng, count, *lens) for lens in ((6.0, 40.0), (1000.0, 0.25))]
-    share = sum(count_wrong_hits(scene, *r, 0.1 if quick else 0.04) for r in rays) / (2 * count)
+    step = 0.1 if quick else 0.04
+    wrong = sum(count_wrong_hits(scene, origin, direction, step) for origin, direction in rays)
     return Row(
         "rays that hit another surface, or none",
         "of the rays",
         2 * count,
-        share,
+        wrong / (2 * count),
         0.02 if quick else 0.005,
         0,
     )
@@ -348,14 +350,15 @@ def count_evaluations(quick: bool) -> Row:
     The longest way of a ray: Newton steps, the whole search, Newton steps again; all rays step together."""
     count = 1024  # a size that chunks are not filled up to
     rng = np.random.default_rng(39)
-    columns = [np.float32(rng.standard_normal((3, count))), np.float32(cases.draw_directions(rng, count))]
-    calls, bad = 0, 0
+    origin, direction = rng.standard_normal((3, count)), cases.draw_directions(rng, count)
+    columns = origin.astype(np.float32), direction.astype(np.float32), np.ones((1, count), np.float32)
+    calls, bad = 0.0, 0
     for field in (_field([[0.0] * 3], [0.0], [0.0], 5.0), _sheet(), _thread(), _plateau()):
         with (
             mock.patch.object(tracing, "signed_distance", wraps=tracing.signed_distance) as value,
             mock.patch.object(tracing, "signed_distance_and_slope", wraps=tracing.signed_distance_and_slope) as slope,
         ):
-            t, f = tracing.refined_hits(field, *columns, np.ones((1, count), np.float32))
+            t, f = tracing.refined_hits(field, *columns)
         columns_evaluated = sum(call.args[1].shape[1] for spy in (value, slope) for call in spy.call_args_list)
         calls = max(calls, columns_evaluated / count)
         bad += count_non_finite(t, f)
@@ -380,7 +383,7 @@ def count_hits_of_empty_sets(quick: bool) -> Row:
     field = _field([[0.0] * 3], [0.0], [0.0], 5.0)
     rng, count = np.random.default_rng(40), 1000
     origin, direction = draw_camera_rays(rng, count, 6.0, 40.0)
-    columns = [np.float32(origin), np.float32(direction), np.full((1, count), 6.0, np.float32)]
+    columns = origin.astype(np.float32), direction.astype(np.float32), np.full((1, count), 6.0, np.float32)
     t, f = tracing.refined_hits(field, *columns)
     return Row(
         "empty zero sets",

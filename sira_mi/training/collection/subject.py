@@ -28,8 +28,13 @@ class BrokenHead(ValueError):
 class Source(Protocol):
     """Identities of one kind. Holds paths and numbers only, so that worker processes can take it over."""
 
-    name: str
-    licence: str
+    @property
+    def name(self) -> str:
+        """Name of the source, the first part of its scenes' file names."""
+
+    @property
+    def licence(self) -> str:
+        """Licence of its heads, one line."""
 
     def count(self) -> int:
         """Number of identities."""
