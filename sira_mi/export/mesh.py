@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.sdf import surface
 from sira_mi.files import write_through
 from sira_mi.portrait.load import linear_to_srgb
@@ -27,7 +27,7 @@ def write_mesh(path: Path, shape) -> None:
     mesh = trimesh.Trimesh(
         vertices.T * (MILLIMETRES_PER_UNIT / 1000),
         shape.faces(),
-        vertex_normals=(gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)).T,
+        vertex_normals=unit_columns(gradient).T,
         vertex_colors=(linear_to_srgb(np.clip(albedo.T, 0, 1)) * 255 + 0.5).astype(np.uint8),
         process=False,
     )

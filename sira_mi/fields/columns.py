@@ -54,6 +54,11 @@ def normalise(v):
     return v / in_three(length)
 
 
+def unit_columns(v: np.ndarray) -> np.ndarray:
+    """`normalise` of a NumPy array [3, N]; columns shorter than 1e-6 stay shorter than 1."""
+    return v / np.maximum(np.linalg.norm(v, axis=0), 1e-6)
+
+
 def _padded_size(count: int) -> int:
     """The smallest of 2ᵏ and 3·2ᵏ⁻¹ that is not below `count`."""
     power = 1 << max(count - 1, 1).bit_length()

@@ -11,7 +11,7 @@ import numpy as np
 from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.export.scene import sensor
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import surface
 from sira_mi.plugins.neural_sdf import trace_head
@@ -62,7 +62,7 @@ def seen_points(camera: Camera, head) -> SeenPoints:
     field = head.field()
     x = origin + t * view
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
-    normal = (gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)).astype(np.float32)
+    normal = unit_columns(gradient).astype(np.float32)
     return SeenPoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
 
 

@@ -1,7 +1,9 @@
-"""Adam with checkpoints: Dr.Jit's optimizer, its state as NumPy arrays, and files that hold it."""
+"""Descent by Adam: Dr.Jit's optimizer, one step of it, its state as NumPy arrays, and files that hold that state."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +24,22 @@ def adam(parameters: Mapping[str, np.ndarray], learning_rates: Mapping[str, floa
         optimizer[name] = to_array(value)
         optimizer.set_learning_rate({name: learning_rates[name]})
     return optimizer
+
+
+def take_step(optimizer, losses: Callable[[dict], dict], total: Callable[[dict], Any]) -> dict[str, float]:
+    """One step along the gradient of `total` of the terms that `losses` gives for the parameters; the terms before the
+    step. Terms and total are scalar tensors."""
+    dr.enable_grad(*(optimizer[name] for name in optimizer))
+    terms = losses(dict(optimizer.items()))
+    dr.backward(total(terms))
+    optimizer.step()
+    dr.eval(terms)
+    return {name: float(value.numpy().item()) for name, value in terms.items()}
+
+
+def cosine_fall(share: float, end: float) -> float:
+    """The factor of a learning rate that falls along half a cosine from 1 to `end`, after a `share` of all steps."""
+    return end + (1 - end) * 0.5 * (1 + math.cos(math.pi * share))
 
 
 def parameter_values(optimizer) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sira_mi.fields.columns import evaluate_in_chunks, from_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, unit_columns
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.sg.multisampling import COSINE
 from sira_mi.sg.radiance import Material, reflected_radiance
@@ -71,7 +71,7 @@ def _normals(shape: NeuralSDF, x: np.ndarray) -> np.ndarray:
     """Unit normals [3, N] of the field."""
     field = shape.field()
     (gradient,) = evaluate_in_chunks(lambda p: surface(field, p)[1], x)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+    return unit_columns(gradient)
 
 
 def sample_surface(shape: NeuralSDF) -> Surface:

@@ -17,16 +17,19 @@ from sira_mi.avatar.decoders import SKIN_SPECULAR, diffuse_albedo, illumination,
 from sira_mi.avatar.shape import HeadShape
 from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import evaluate_in_chunks, in_three
+from sira_mi.fields.columns import evaluate_in_chunks, in_three, unit_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.optimisation import losses
+from sira_mi.optimisation.adam import cosine_fall, take_step
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.radiance import Material, radiance_of_scenes
 from sira_mi.training.scenes import TrainingScene
 
 NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
 LATENTS = ("z_a", "z_s", "z_l")
+# Share of the learning rates that is left at the end.
+_LAST_RATE = 0.05
 # Observations within this distance of a landmark tell how bright the skin is in the photos, scene units.
 _SKIN_RADIUS = 0.06
 
@@ -104,7 +107,7 @@ def freeze_scene(
     return FrozenScene(
         x_ref,
         gamma,
-        gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6),
+        unit_columns(gradient),
         np.array(settings.specular_levels, np.float32)[None, scene.region[chosen]],
         jittered_x_ref,
         jittered_gamma,
@@ -209,7 +212,7 @@ def weighted_sum(terms: dict, settings: AppearanceTraining):
 
 def rates(settings: AppearanceTraining, step: int) -> dict[str, float]:
     """Learning rate of every parameter at `step`."""
-    fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / settings.steps))
+    fall = cosine_fall(step / settings.steps, _LAST_RATE)
     return {
         **dict.fromkeys(NETWORKS, settings.learning_rate * fall),
         **dict.fromkeys(LATENTS, settings.latent_rate * fall),
@@ -218,11 +221,11 @@ def rates(settings: AppearanceTraining, step: int) -> dict[str, float]:
 
 def training_step(architecture, settings: AppearanceTraining, optimizer, batch: AppearanceBatch) -> dict[str, float]:
     """One Adam step; returns the unweighted terms."""
-    dr.enable_grad(*(optimizer[name] for name in optimizer))
-    terms = appearance_losses(architecture, settings, dict(optimizer.items()), batch)
-    dr.backward(weighted_sum(terms, settings))
-    optimizer.step()
-    return {name: float(value.numpy().item()) for name, value in terms.items()}
+    return take_step(
+        optimizer,
+        lambda parameters: appearance_losses(architecture, settings, parameters, batch),
+        lambda terms: weighted_sum(terms, settings),
+    )
 
 
 def skin_radiance(scene: TrainingScene, landmarks: np.ndarray) -> float:

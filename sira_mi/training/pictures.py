@@ -14,7 +14,7 @@ from scipy.ndimage import affine_transform
 
 from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface, extract
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, signed_distance, surface
@@ -90,7 +90,7 @@ def head_tile(field: SdfField, extracted: ExtractedSurface | None = None, yaw: f
     slope = np.minimum((ray * gradient).sum(axis=0), -0.1)
     moved = points + ray * np.clip(-f[0] / slope, -_VOXEL, _VOXEL)[:count]
     (gradient,) = evaluate_in_chunks(lambda x: surface(field, x)[1], _padded(moved))
-    normals = gradient[:, :count] / np.maximum(np.linalg.norm(gradient[:, :count], axis=0), 1e-6)
+    normals = unit_columns(gradient[:, :count])
     closing = (moved <= np.array(DOMAIN_LOWER)[:, None] + 0.02) | (moved >= np.array(DOMAIN_UPPER)[:, None] - 0.02)
     grey = np.where(closing.any(axis=0), 0.5, _shade(normals, view))
     tile[hit] = grey[:, None]
@@ -160,7 +160,7 @@ class AppearancePicture:
         for k, points in zip(self.chosen, self.points, strict=True):
             field = model.field(latents[:, k])
             _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x, field=field: surface(field, x), points.T)
-            self.frozen.append((gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6), x_ref, gamma))
+            self.frozen.append((unit_columns(gradient), x_ref, gamma))
 
     def write(self, path: Path, parameters: dict[str, np.ndarray]) -> None:
         """Writes one row a scene: albedo, specular albedo (eight times as bright), under its own light, under that of

@@ -16,11 +16,14 @@ from sira_mi.fields.columns import normalise
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, sphere_parameters, surface
 from sira_mi.optimisation import losses
+from sira_mi.optimisation.adam import cosine_fall, take_step
 from sira_mi.training.scenes import TrainingScene
 
 NETWORKS = (*SHAPE_NETWORKS, "rendering")
 LATENTS = (*SHAPE_LATENTS, "z_r")
 
+# Share of the learning rates that is left at the end.
+_LAST_RATE = 0.05
 # Deviation of the random heads' points from the scenes' surfaces, scene units.
 _JITTER = 0.1
 
@@ -175,7 +178,7 @@ def rates(settings: ShapeTraining, step: int) -> dict[str, float]:
     first, length, height = 0, settings.steps, 1.0
     if step >= settings.steps:
         first, length, height = settings.steps, all_steps(settings) - settings.steps, settings.finishing_rate
-    fall = height * (0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * (step - first) / max(length, 1))))
+    fall = height * cosine_fall((step - first) / max(length, 1), _LAST_RATE)
     return {
         **dict.fromkeys(NETWORKS, settings.learning_rate * fall),
         **dict.fromkeys(LATENTS, settings.latent_rate * fall),
@@ -192,9 +195,8 @@ def weights_at(settings: ShapeTraining, step: int) -> ShapeTraining:
 
 def training_step(architecture, settings: ShapeTraining, optimizer, batch: ShapeBatch) -> dict[str, float]:
     """One Adam step; returns the unweighted terms."""
-    dr.enable_grad(*(optimizer[name] for name in optimizer))
-    terms = shape_losses(architecture, dict(optimizer.items()), batch)
-    dr.backward(weighted_sum(terms, settings))
-    optimizer.step()
-    dr.eval(terms)
-    return {name: float(value.numpy().item()) for name, value in terms.items()}
+    return take_step(
+        optimizer,
+        lambda parameters: shape_losses(architecture, parameters, batch),
+        lambda terms: weighted_sum(terms, settings),
+    )

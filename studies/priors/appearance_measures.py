@@ -24,10 +24,10 @@ from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.avatar.shape import HeadShape, head_of
 from sira_mi.conventions import HELD_OUT_VIEWS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns, unit_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import surface
-from sira_mi.optimisation.adam import adam, parameter_values
+from sira_mi.optimisation.adam import adam, cosine_fall, parameter_values, take_step
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.pictures import psnr
@@ -144,14 +144,15 @@ def fit_appearance_latents(
     start = {name: np.repeat(avatar.tensors[name][:, None], len(scenes), axis=1) for name in af_sm.LATENTS}
     optimizer = adam(start, dict.fromkeys(af_sm.LATENTS, fit.rate), fit.beta_2)
     for step in range(fit.steps):
-        fall = 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / fit.steps))
-        optimizer.set_learning_rate(dict.fromkeys(af_sm.LATENTS, fit.rate * fall))
-        latents = {name: optimizer[name] for name in af_sm.LATENTS}
-        dr.enable_grad(latents)
+        optimizer.set_learning_rate(dict.fromkeys(af_sm.LATENTS, fit.rate * cosine_fall(step / fit.steps, 0.05)))
         batch = af_sm.draw_batch(frozen, settings, np.random.default_rng([seed, 6, step]))
-        terms = af_sm.appearance_losses(avatar.architecture, settings, {**networks, **latents}, batch)
-        dr.backward(af_sm.weighted_sum(terms, settings))
-        optimizer.step()
+        take_step(
+            optimizer,
+            lambda latents, batch=batch: af_sm.appearance_losses(
+                avatar.architecture, settings, networks | latents, batch
+            ),
+            lambda terms: af_sm.weighted_sum(terms, settings),
+        )
     return parameter_values(optimizer)
 
 
@@ -178,7 +179,7 @@ def surface_inputs(avatar: Avatar, z_sdf: np.ndarray, points: np.ndarray) -> lis
     """x_ref [3, N], γ [N_γ, N] and unit normals [3, N] of the field with latent `z_sdf` [dim] at points [N, 3]."""
     field = HeadShape(avatar.architecture).field({**avatar.tensors, "z_sdf": z_sdf})
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x: surface(field, x), points.T)
-    return [x_ref, gamma, gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)]
+    return [x_ref, gamma, unit_columns(gradient)]
 
 
 def factors(avatar: Avatar, latents: dict[str, np.ndarray], inputs: Sequence[np.ndarray], views: np.ndarray) -> Factors:

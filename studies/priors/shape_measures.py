@@ -22,11 +22,11 @@ from scipy.spatial import cKDTree
 from sira_mi.avatar.decoders import rendered_radiance
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface
 from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.optimisation import losses
-from sira_mi.optimisation.adam import adam
+from sira_mi.optimisation.adam import adam, cosine_fall
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.pictures import blank_tile, extracted_surface, head_tile
 from sira_mi.training.scenes import TrainingScene, load_scene
@@ -117,10 +117,6 @@ def _latents(model: ShapeModel, name: str, w):
     return mi.TensorXf(model.bases[name]) @ w + mean
 
 
-def _fall(step: int, steps: int) -> float:
-    return 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * step / steps))
-
-
 def fit_shape(
     model: ShapeModel, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None, seed: int = 0
 ) -> np.ndarray:
@@ -130,7 +126,7 @@ def fit_shape(
     size = model.bases["z_sdf"].shape[1]
     optimizer = adam({"w": np.zeros((size, len(scenes)), np.float32)}, {"w": fit.rate})
     for step in range(fit.steps):
-        optimizer.set_learning_rate({"w": fit.rate * _fall(step, fit.steps)})
+        optimizer.set_learning_rate({"w": fit.rate * cosine_fall(step / fit.steps, 0.05)})
         rng = np.random.default_rng([seed, 11, step])
         chosen = [rng.integers(len(scene.points), size=fit.points) for scene in scenes]
         points = np.concatenate([s.points[c] for s, c in zip(scenes, chosen, strict=True)])
@@ -158,7 +154,7 @@ def color_errors(
         field = model.field(model.latent("z_sdf", w[:, k]))
         x = scene.points[scene.sample_point[samples]].T
         _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x, field=field: surface(field, x), x)
-        normals = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
+        normals = unit_columns(gradient)
         inputs.append([x_ref, normals, scene.views(samples).T, gamma, scene.sample_color[samples].T])
     arrays = [np.stack(column, axis=1) for column in zip(*inputs, strict=True)]  # [rows, S, 4096]
 
@@ -170,7 +166,7 @@ def color_errors(
     size = model.bases["z_r"].shape[1]
     optimizer = adam({"w": np.zeros((size, len(scans)), np.float32)}, {"w": 0.1})
     for step in range(steps):
-        optimizer.set_learning_rate({"w": 0.1 * _fall(step, steps)})
+        optimizer.set_learning_rate({"w": 0.1 * cosine_fall(step / steps, 0.05)})
         w_r = optimizer["w"]
         dr.enable_grad(w_r)
         index = np.random.default_rng([seed, 13, step]).integers(2048, size=points)
