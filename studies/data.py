@@ -10,7 +10,7 @@ from studies.cache import write_json
 
 
 def write_figures(path: Path, figures: dict) -> dict:
-    """Writes figures with `measured`, the revision and the date of today, before them; returns what was written."""
+    """Writes figures preceded by `measured`, today's date and the revision; returns what was written."""
     dated = {"measured": {"revision": current_revision(), "date": f"{datetime.now(timezone.utc):%Y-%m-%d}"}, **figures}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, dated)

@@ -19,15 +19,3 @@ def number(value: float | None, digits: int = 2) -> str:
 def percent(value: float) -> str:
     """A share as a whole percentage."""
     return f"{100 * value:.0f}%"
-
-
-def average(rows: Sequence[dict], *path: str) -> float:
-    """The mean over rows of the number at a path of keys, NaN left out; NaN when none is left."""
-    found = []
-    for row in rows:
-        value = row
-        for key in path:
-            value = value[key]
-        found.append(value)
-    values = np.array(found, float)
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

@@ -1,6 +1,8 @@
 """Measures of numbers and images against the truth: statistics, SSIM, scaling, leakage, each independent of any model;
 and the definitions of face, head and specular strength that all studies share. PSNR is `relight.pictures.psnr`."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from skimage.metrics import structural_similarity
 
@@ -21,6 +23,23 @@ def statistics(values: np.ndarray) -> dict[str, float]:
         "median": float(np.median(values)),
         "p90": float(np.percentile(values, 90)),
     }
+
+
+def average(rows: Sequence[dict], *path: str) -> float:
+    """The mean over rows of the number at a path of keys, NaN left out; NaN when none is left."""
+    found = []
+    for row in rows:
+        value = row
+        for key in path:
+            value = value[key]
+        found.append(value)
+    values = np.array(found, float)
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+
+
+def spread_indices(count: int, limit: int) -> list[int]:
+    """At most `limit` indices, evenly spread over range(count)."""
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int)).tolist()
 
 
 def scale_channels(values: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""The benchmark of portraits: photos with known truth, methods that fit them, scores, the page of results."""
+"""The benchmark of portraits: rendered photos with known truth, methods that fit them, scores, figures and page."""

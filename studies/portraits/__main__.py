@@ -27,7 +27,7 @@ def main() -> None:
     portraits.add_argument("--valid", type=Path, help="folder of VALID avatars that the collection was built with")
     portraits.add_argument("--meshes", type=Path, help="folder of meshes that the collection was built with")
     portraits.add_argument("--hdri", type=Path, help="folder of .exr maps for the outdoor lights; else sun and sky")
-    portraits.add_argument("--sources", nargs="+", metavar="NAME", help="use these sources only, of the collection's")
+    portraits.add_argument("--sources", nargs="+", metavar="NAME", help="only these of the collection's sources")
     portraits.add_argument("--primary", action="store_true", help="one light of each head instead of three")
     portraits.add_argument(
         "--split", choices=("test", "train"), default="test", help="train: for `skin` and `landmarks`, not for scores"
@@ -36,7 +36,7 @@ def main() -> None:
     portraits.add_argument("--size", type=int, default=512, metavar="N", help="of a photo, pixels (default: 512)")
     portraits.add_argument("--samples", type=int, default=256, metavar="N", help="paths a pixel, a power of 4")
     portraits.add_argument("--workers", type=int, default=1, help="processes")
-    skin = commands.add_parser("skin", help="measure what photos tell of the level of their skin's albedo")
+    skin = commands.add_parser("skin", help="measure how well photos predict the level of their skin's albedo")
     skin.add_argument("--benchmark", type=Path, required=True, help="portraits of training heads")
     skin.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
     landmarks = commands.add_parser("landmarks", help="measure and correct landmarks of photos and of the prior")
@@ -170,7 +170,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_benchmark(arguments: argparse.Namespace) -> None:
-    """Builds the benchmark that the command line describes and prints what it holds."""
+    """Builds the benchmark that the command line describes and prints a summary."""
     from studies.portraits.benchmark import build_benchmark
     from studies.portraits.benchmark_photo import PhotoSettings
     from studies.portraits.benchmark_plan import BenchmarkSettings, select_sources

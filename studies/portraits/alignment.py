@@ -1,4 +1,4 @@
-"""How a predicted head is laid over the true one: by six landmarks, by robust ICP with scale, or by the photo's camera.
+"""Alignment of a predicted head with the true one: by six landmarks, by robust ICP with scale, or by the camera.
 
 All maps are similarities from the prediction's world to the truth's.
 """
@@ -26,12 +26,12 @@ class Icp:
     """Settings of `icp`."""
 
     iterations: int = 30
-    kept: float = 0.9  # share of the points, those nearest to the surface, that count
+    kept: float = 0.9  # share of the points that count, the closest to the surface
     damping: float = 1e-3  # weight of each point's squared motion beside its squared distance to the tangent plane
 
 
 def select_shared_landmarks(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Those of the six landmarks that are known on both sides, of [468, 3] with NaN where unknown: [n, 3] of each.
+    """The six landmarks that both sides know, from arrays [468, 3] with NaN where unknown: [n, 3] of each.
 
     Raises InputError for fewer than four."""
     six = np.array(SIX_LANDMARKS)
@@ -55,7 +55,7 @@ def inverse(map: Similarity) -> Similarity:
 
 
 def distances_from(points: np.ndarray, tree: TriangleTree, map: Similarity) -> np.ndarray:
-    """Distances [P], in the target's units, from points [P, 3] to the mesh of `tree` when it is laid over them."""
+    """Distances [P], in the target's units, from points [P, 3] to the mesh of `tree` after it is mapped by `map`."""
     return map.scale * tree.nearest(inverse(map)(points))[0]
 
 
@@ -95,14 +95,14 @@ def _step(points, normals, goals, damping):
 
 
 def camera_scale(predicted: np.ndarray, truth: np.ndarray, predicted_camera: Camera, truth_camera: Camera) -> float:
-    """The factor about the camera's centre that brings the prediction's landmarks [n, 3] nearest to the truth's in
-    least squares, each in its own camera's coordinates. One photo cannot tell it: size and distance go together."""
+    """The scale about the camera's centre that fits the prediction's landmarks [n, 3] to the truth's in least squares,
+    each in its own camera's coordinates. A single photo does not determine it: size and distance are ambiguous."""
     p, t = _local(predicted, predicted_camera), _local(truth, truth_camera)
     return float((p * t).sum() / (p * p).sum())
 
 
 def camera_alignment(predicted: Camera, truth: Camera, scale: float = 1.0) -> Similarity:
-    """The map that lays one camera over the other, the prediction scaled by a factor about its camera's centre."""
+    """The map from one camera to the other, with the prediction scaled about its camera's centre."""
     back = truth.world_to_camera[:3, :3].T
     shift = scale * predicted.world_to_camera[:3, 3] - truth.world_to_camera[:3, 3]
     return Similarity(scale, back @ predicted.world_to_camera[:3, :3], back @ shift)

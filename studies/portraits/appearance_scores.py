@@ -1,10 +1,10 @@
-"""How far a predicted appearance is from the true one, in the photo's pixels.
+"""Errors of a predicted appearance at the photo's pixels.
 
 All images are linear. They are compared inside both masks (coverage above 0.5), one pixel away from their common edge.
 PSNR and SSIM are of sRGB-coded values with peak 1; SSIM is the mean over those pixels of the map with uniform windows
 of 7 x 7 pixels, both images black outside. Specular albedo, reflectance at normal incidence, is compared as strength,
-that is over 0.08, so that it fills the range. `scaled` is after the one factor a channel that is best in least squares
-over the pixels compared: it takes out what the exposure leaves open between light and albedo.
+that is divided by 0.08. `scaled` is after one factor per channel, the best in least squares over the pixels compared:
+it removes the ambiguity of scale between light and albedo.
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from sira_mi.training.collection.skin import SKIN
 from studies.measures import F0_OF_STRENGTH, correlation, luminance, scale_channels, ssim_inside
 from studies.portraits.truth import Truth, check_array
 
-_EDGE = np.ones((3, 3), bool)  # what is eroded: a pixel, its sides and corners
+_EDGE = np.ones((3, 3), bool)  # structuring element of the erosion
 _DARKEST = 1e-4  # shading below this counts as this, so that it has a logarithm
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedAppearance:
-    """What a method says of a portrait, at the photo's pixels; linear."""
+    """A method's estimate of a portrait's appearance, linear, at the photo's pixels."""
 
     final: np.ndarray  # [H, W, 3] radiance, exposed as in the photo
     diffuse_albedo: np.ndarray  # [H, W, 3]
@@ -100,11 +100,11 @@ def colour_scores(prefix: str, albedo: np.ndarray, truth: np.ndarray) -> dict[st
 
 
 def leakage_scores(albedo: np.ndarray, truth: np.ndarray, shading: np.ndarray, shadow: np.ndarray) -> dict[str, float]:
-    """What of the light is left in the albedo, over pixels of albedos [N, 3]: Pearson's correlation of the error of the
+    """Light that leaked into the albedo, over pixels of albedos [N, 3]: Pearson's correlation of the error of the
     log albedo's luminance with the log of `shading` [N], `leakage_shading`, and with `shadow` [N], `leakage_shadow`,
     both absolute, and with their signs `leakage_shading_signed` and `leakage_shadow_signed` (positive: the albedo is
-    too dark where there is little light); `leakage_slope`, the share of log shading that the albedo took over, by
-    linear regression: 0 none, 1 all of it. An error or a light that is constant leaks nothing: 0."""
+    too dark where there is little light); `leakage_slope`, the share of log shading in the albedo, by linear
+    regression: 0 none, 1 all of it. An error or a light that is constant leaks nothing: 0."""
     error = np.log(luminance(albedo)) - np.log(luminance(truth))
     light = np.log(np.maximum(shading.astype(np.float64), _DARKEST))
     by_shading, by_shadow = correlation(error, light), correlation(error, shadow.astype(np.float64))

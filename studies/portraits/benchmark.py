@@ -2,8 +2,8 @@
 
 DIR/benchmark.json              format, settings, portraits
 DIR/NAME/photo.jpg              what a fit sees
-DIR/NAME/truth.npz              what only the evaluation sees, `TRUTH`
-DIR/NAME/portrait.json          the portrait's entry, and the key under which it was taken
+DIR/NAME/truth.npz              what only the scores use, `TRUTH`
+DIR/NAME/portrait.json          the portrait's entry, and the key of its settings
 """
 
 import json
@@ -76,7 +76,7 @@ def build_benchmark(
     workers: int,
     settings: BenchmarkSettings | None = None,
 ) -> list[dict]:
-    """Takes the portraits that `out` does not hold yet and returns the entries of `benchmark.json`, which is written
+    """Renders the portraits that `out` does not hold yet and returns the entries of `benchmark.json`, which is written
     last. Only heads of the given sources are used. Raises InputError when a source's data are not those that the
     collection was built with."""
     settings = settings or BenchmarkSettings()
@@ -182,8 +182,8 @@ def portrait(view: View, subject: Subject, shot: Shot) -> tuple[np.ndarray, dict
 
 def exposure_of(radiance, mask, truth, chin, light) -> float:
     """The camera's exposure: a factor that brings the mean luminance of the head above the `chin` [3] to
-    `MEAN_LUMINANCE`, half way (by the root) towards what its albedo deserves, but not more than leaves `UNCLIPPED` of
-    the person below white."""
+    `MEAN_LUMINANCE`, scaled by the root of its albedo over `USUAL_ALBEDO`, but so that at least `UNCLIPPED` of
+    the person is below white."""
     weights = np.array(LUMINANCE)
     head = mask * (truth["region"] != CLOTH) * (truth["region"] != NOTHING)
     local = truth["world_to_camera"][:3, :3] @ chin + truth["world_to_camera"][:3, 3]

@@ -1,4 +1,4 @@
-"""The three lights that every identity of the benchmark is photographed under, and what is seen behind the person.
+"""The three lights of the benchmark, and the background of each.
 
 `studio` is a broad key with a fill, `outdoor` a captured environment or sun and sky, `extreme` one small bright lobe:
 from the side, from behind, or strongly coloured.
@@ -36,9 +36,8 @@ def light_map(light: str, random: np.random.Generator, yaw: float, environment: 
 
 
 def backdrop(light: str, random: np.random.Generator, image: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """What the pixels of viewing directions [H, W, 3] show where the person is not, [H, W, 3]: for `outdoor` the
-    environment `image` [h, 2h, 3], blurred, in its scale, else a grey wall that darkens to the corners, in the photo's
-    scale."""
+    """The background [H, W, 3] in viewing directions [H, W, 3]: for `outdoor` the blurred environment `image`
+    [h, 2h, 3] in its own scale, otherwise a grey wall that darkens towards the corners, in the photo's scale."""
     if light == "outdoor":
         return look_up(blurred(image, SOFT), directions)
     brightness = random.uniform(0.14, 0.45) if light == "studio" else random.uniform(0.04, 0.1)

@@ -29,7 +29,7 @@ class PhotoSettings:
     samples: int = 256  # paths a pixel, a power of four
     depth: int = 6  # path length, bounces
     shading_samples: int = 64  # directions a pixel, of the truth's shading and shadow; a power of four
-    specular_step: float = 0.05  # what specular strengths are rounded to; 0.004 of reflectance
+    specular_step: float = 0.05  # specular strengths are rounded to its multiples; 0.004 of reflectance
 
 
 def portrait_camera(
@@ -84,7 +84,7 @@ def draw_roughness(random: np.random.Generator) -> dict[int, float]:
 
 
 class View:
-    """An identity before its camera: what does not depend on the light is found once for all photos."""
+    """An identity and its camera. What does not depend on the light is computed once for all photos."""
 
     def __init__(self, parts: list[Part], roughness: dict[int, float], K, world_to_camera, settings: PhotoSettings):
         self.settings = settings
@@ -221,7 +221,7 @@ class View:
         return values[..., :3], values[..., 3] / np.maximum(values[..., 4], 1e-12)
 
     def _mean(self, sample, pixels, samples, seed):
-        """Means [H, W, C] of what `sample(sampler, pixel)` gives at `pixels`, 0 elsewhere; sums in a fixed order."""
+        """Means [H, W, C] of `sample(sampler, pixel)` at `pixels`, 0 elsewhere; summed in a fixed order."""
         size, count = self.settings.size, len(pixels)
         per_launch = samples
         while per_launch > 1 and count * per_launch > LANES:

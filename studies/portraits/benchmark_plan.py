@@ -35,7 +35,7 @@ WORN = 0.01  # share of a head's points from which it has hair, or clothes
 class BenchmarkSettings:
     identities: int = 12
     seed: int = 0
-    split: str = "test"  # whose heads are photographed; portraits of training heads may tune a fit, never score it
+    split: str = "test"  # of the collection; portraits of training heads may tune a fit, never score it
     primary_only: bool = False  # one light of each identity instead of three
     photo: PhotoSettings = field(default_factory=PhotoSettings)
 
@@ -70,7 +70,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Shot:
-    """One portrait to be taken."""
+    """One portrait to be rendered."""
 
     identity: Identity
     pose: Pose
@@ -85,7 +85,7 @@ class Shot:
         return f"{self.identity.title}_{self.light}"
 
     def key(self, photo: PhotoSettings) -> str:
-        """What the portrait depends on."""
+        """Hash of everything that the portrait depends on."""
         described = json.dumps([FORMAT, asdict(self) | {"environment": None}, asdict(photo)], sort_keys=True)
         return fingerprint(described, *([self.environment] if self.light == "outdoor" and self.environment else []))
 
@@ -180,7 +180,7 @@ def choose_identities(heads: list[Identity], count: int, seed: int) -> list[Iden
 
 
 def _traits(head):
-    """What heads are told apart by; unknown traits do not count."""
+    """The known traits of a head, by which heads are chosen to differ."""
     hair = head.person.get("hair")
     style = hair["name"] if isinstance(hair, dict) else head.hair
     known = [(name, value) for name, value in head.group.items() if value != "unknown"]

@@ -29,7 +29,7 @@ _VERSION = "1"
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is fitted and scored."""
+    """The portraits and methods to compare, and their settings."""
 
     benchmark: Path
     runs: Path  # folder of the fits
@@ -44,7 +44,7 @@ class Comparison:
 
 def compare(comparison: Comparison) -> list[dict]:
     """Fits and scores: rows of `portrait`, `identity`, `light`, `method`, `scores`, and of a fit `seconds` by stage,
-    `total_seconds` and `peak_memory_megabytes`, or its `error`. What RUNS holds already is not done again."""
+    `total_seconds` and `peak_memory_megabytes`, or its `error`. Results on disk are used."""
     methods = _complete(comparison.methods)
     entries = [
         entry
@@ -64,7 +64,7 @@ def compare(comparison: Comparison) -> list[dict]:
 
 
 def _complete(names: Sequence[str]) -> list[str]:
-    """The methods and those that they go on from, in the order of `METHODS`."""
+    """The methods and those that they continue from, in the order of `METHODS`."""
     if unknown := set(names) - set(BY_NAME):
         raise InputError(f"unknown methods {', '.join(sorted(unknown))}; known are {', '.join(BY_NAME)}")
     wanted: set[str] = set()
@@ -118,7 +118,7 @@ def _portrait_rows(comparison: Comparison, entry: dict, methods: list[str]):
 
 
 def mean_head(photo: Path, prior_path: Path) -> PredictedHead:
-    """What the table compares with: the prior's mean head in the camera that the photo's landmarks give it."""
+    """The baseline: the prior's mean head in the camera estimated from the photo's landmarks."""
     prior = load_avatar(prior_path)
     portrait = make_portrait(photo, PortraitSettings(), prior.tensors["landmarks"])
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(prior_path), "voxel": 0.05})

@@ -1,6 +1,6 @@
-"""One fit of a portrait by a method, and the files that it is scored by and gone on from.
+"""Fits a portrait by one method and writes the files for scores and for methods that continue from it.
 
-A fit sees the photo only. It leaves `avatar.safetensors`, `tensors.safetensors` (where a method goes on from) and
+A fit gets the photo only. It writes `avatar.safetensors`, `tensors.safetensors` (the start of later methods) and
 `head.npz` (mesh, landmarks, camera and pictures).
 """
 
@@ -66,7 +66,7 @@ def _photo_camera(photo: Path, camera: Camera) -> Camera:
 
 
 def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settings: FitSettings) -> None:
-    """`head.npz`: what scores are taken of."""
+    """Writes `head.npz`, the input of the scores."""
     path = out / "avatar.safetensors"
     avatar = load_avatar(path)
     if method.after is None:

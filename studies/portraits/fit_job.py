@@ -18,13 +18,13 @@ class Job:
     prior: Path
     settings: FitSettings
     out: Path  # RUNS/PORTRAIT/METHOD
-    before: Path | None  # folder of the fit that it goes on from
+    before: Path | None  # folder of the fit that it continues from
     seed: int = 0
     variant: str = "llvm_ad_rgb"
 
     def key(self) -> str:
-        """What the result depends on; weights of a kind of stages count where the method has such a stage, those of
-        the geometry in the shading stage too."""
+        """Hash of everything that the result depends on. Weights count only where the method has a stage that uses
+        them; the shading stage uses those of the geometry."""
         settings = BY_NAME[self.method].settings(self.settings)
         kinds = {GEOMETRY if kind == SHADING else kind for kind, _ in settings.stages}
         optional = {GEOMETRY, APPEARANCE, POLISH} - kinds

@@ -1,15 +1,15 @@
-"""How far a predicted head is from the true one: distances between surfaces, angles between normals, silhouettes.
+"""Errors of a predicted head: distances between surfaces, angles between normals, overlap of silhouettes.
 
 Distances are in mm from points, spread evenly by area over the outer surface of one head, to the outer surface of the
-other, never to its vertices. Each is measured after four ways of laying the prediction over the truth:
+other, never to its vertices. Each is measured after four alignments:
 
     h3ds        six landmarks, then ICP with scale on the skin of the face: after the protocol of H3DS
                 (Ramon et al. 2021), whose distances are to the nearest vertex
     landmarks   six landmarks alone
-    camera      each head where its own camera has it, one scale about the camera's centre
+    camera      both in their own camera's coordinates, one scale about the camera's centre
     camera_raw  the same without that scale
 
-in these regions of the truth, to which a predicted point belongs by where it lies and by its nearest true point:
+in these regions of the truth. A predicted point is assigned by its position and its closest true point:
 
     face      within 95 mm of the nose tip, skin and eyes only: what hair or cloth covers does not count
     face_all  the same sphere, with everything in it
@@ -66,7 +66,7 @@ class GeometrySettings:
 
 @dataclass(frozen=True, eq=False)
 class PredictedHead:
-    """What a method says of a portrait. Lengths in scene units of 100 mm; the world is any, but the same for all."""
+    """A method's estimate of a head. Lengths in scene units of 100 mm; all fields share one world frame."""
 
     vertices: np.ndarray  # [N, 3]
     faces: np.ndarray  # [T, 3]
@@ -94,7 +94,7 @@ class PredictedHead:
 
 @dataclass(frozen=True, eq=False)
 class TrueSurface:
-    """What is computed of a truth once, whatever is compared with it."""
+    """Data computed once per truth, for all predictions."""
 
     outer: OuterSurface
     tree: TriangleTree  # of the outer surface
@@ -108,7 +108,7 @@ def true_surface(truth: Truth, settings: GeometrySettings | None = None) -> True
     settings = settings or GeometrySettings()
     nose = truth.landmarks[NOSE_TIP]
     if not np.isfinite(nose).all():
-        raise InputError(f"the truth has no landmark {NOSE_TIP}, the nose tip: the face cannot be told")
+        raise InputError(f"the truth has no landmark {NOSE_TIP}, the nose tip: the face is undefined")
     outer = outer_surface(truth.vertices, truth.faces, settings.samples, SHOULDERS, settings.seed)
     if not len(outer.points):
         raise InputError("nothing of the truth's head can be seen from outside")

@@ -1,5 +1,5 @@
-"""What the landmark network gets wrong on heads whose landmarks are known: least squares over portraits of training
-heads, which gives the correction of `sira_mi.portrait.head_landmarks`."""
+"""Errors of detected landmarks on portraits of training heads, and the correction of `sira_mi.portrait.head_landmarks`
+by least squares."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +44,7 @@ class Observation:
 
 
 def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
-    """The landmarks of the portraits of training heads in a folder, and the names of those whose face is not found.
+    """The landmarks of the portraits of training heads in a folder, and the names of portraits without a detected face.
     Raises InputError for portraits of test heads."""
     found, blind = [], []
     for entry in tqdm(read_benchmark(benchmark, "train"), unit="portrait", dynamic_ncols=True):
@@ -64,8 +64,8 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
 
 
 def fit_correction(observations: list[Observation]) -> LandmarkCorrection:
-    """Least squares of the offsets by the polynomial of the direction. Landmarks that a head does not know count as the
-    mean of the others'."""
+    """Least-squares fit of the offsets by the polynomial of the viewing direction. Unknown landmarks of a head count as
+    the mean of the other heads'."""
     mean = _mean_face(observations)
     directions = np.stack([seen_from(o.face, mean) for o in observations])
     offsets = np.stack([o.offset for o in observations])
@@ -77,8 +77,8 @@ def fit_correction(observations: list[Observation]) -> LandmarkCorrection:
 
 
 def _mean_face(observations: list[Observation]) -> np.ndarray:
-    """The mean [468, 3] of the network's faces, each turned as it, beginning with the one that is seen most from the
-    front by its depths."""
+    """The mean [468, 3] of the detected faces, aligned with it iteratively. The first is the most frontal one by its
+    depths."""
     skew = [abs(np.corrcoef(o.face.depth, o.face.landmarks[:, 0])[0, 1]) for o in observations]
     first = observations[int(np.argmin(skew))].face
     mean = np.column_stack([first.landmarks, first.depth]) / first.size
@@ -88,8 +88,8 @@ def _mean_face(observations: list[Observation]) -> np.ndarray:
 
 
 def measure_held_out_errors(observations: list[Observation]) -> tuple[float, float]:
-    """Mean distance of found and of corrected landmarks to the true ones, in face sizes, each head by what the others
-    tell. Raises InputError for too few heads."""
+    """Mean distance of detected and of corrected landmarks to the true ones, in face sizes, cross-validated over heads.
+    Raises InputError for too few heads."""
     heads = sorted({o.head for o in observations})
     if len(heads) < _LEAST_HEADS:
         raise InputError(f"{len(heads)} heads whose face is found: {_LEAST_HEADS} are needed")

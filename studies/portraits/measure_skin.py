@@ -1,6 +1,5 @@
-"""What a photo tells of the level of its skin's albedo: least squares over portraits whose albedo is known, which gives
-the values of `sira_mi.fit.skin.SkinLevel`. Portraits of training heads serve, since a fit may know nothing of the
-others."""
+"""How well a photo predicts the level of its skin's albedo: least squares over portraits of training heads, which gives
+the values of `sira_mi.fit.skin.SkinLevel`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,15 +40,15 @@ class Observation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The level that tells most of the albedo."""
+    """The best predictor of the albedo's level."""
 
     level: SkinLevel
-    error: float  # root mean square of the log luminance, each head by what the others tell
+    error: float  # root mean square of the log luminance, cross-validated over heads
     error_by_skin: float  # the same by the skin's radiance alone, least squares
 
 
 def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
-    """The skin of the portraits of training heads in a folder, and the names of those without a face or visible skin.
+    """The skin of the portraits of training heads in a folder, and the names of portraits without face or visible skin.
     Raises InputError for portraits of test heads."""
     landmarks = load_avatar(PRIOR).tensors["landmarks"]
     settings = PortraitSettings(working_size=QUALITIES["draft"].working_size)
@@ -110,7 +109,7 @@ def _predict(level: SkinLevel, observations: list[Observation]) -> np.ndarray:
 
 
 def _fit_level(observations: list[Observation]) -> SkinLevel:
-    """Least squares with a weak pull to the start, which the few misleading eyes need; widths by their logarithms."""
+    """Least squares with a weak pull to the start, since few eyes mislead; widths by their logarithms."""
     cues, target = cue_arrays([o.cues for o in observations]), np.log([o.luminance for o in observations])
 
     def level(x: np.ndarray) -> SkinLevel:

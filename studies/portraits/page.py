@@ -118,7 +118,7 @@ class Mark:
 
 
 def find(figures: dict, *path: str) -> Any:
-    """What stands at a path of keys; None where a key is missing."""
+    """The value at a path of keys; None where a key is missing."""
     value: Any = figures
     for key in path:
         if key not in value:

@@ -15,7 +15,7 @@ _SHEET_PORTRAITS = 6
 
 
 def write_picture(rows: Sequence[dict], benchmark: Path, runs: Path, path: Path) -> None:
-    """The picture of the first portraits whose fit by the shipped method, in the folder `runs`, has scores."""
+    """Draws the first portraits that the shipped method has fitted, from their folders in `runs`."""
     shown = [row["portrait"] for row in rows if row["method"] == SHIPPED and "scores" in row][:_SHEET_PORTRAITS]
     if shown:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Exact distances from points to triangle meshes, and their slow reference.
+"""Exact distances from points to triangle meshes, and a slow reference.
 
 The triangles, in Morton order, are the leaves of a complete binary tree of bounding boxes, which every point walks
 depth first and without a stack. It starts with an upper bound, the distance to the triangle with the nearest centroid,

@@ -1,4 +1,4 @@
-"""The truth of a benchmark portrait: what only the evaluation sees of it."""
+"""The truth of a benchmark portrait, which only the scores use."""
 
 from dataclasses import dataclass
 from pathlib import Path

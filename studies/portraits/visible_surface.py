@@ -1,4 +1,4 @@
-"""What can be seen of a mesh: its outer surface, even samples of it, what a camera sees, and images of its normals."""
+"""The visible part of a mesh: its outer surface, even samples of it, visibility from a camera, images of normals."""
 
 from __future__ import annotations
 

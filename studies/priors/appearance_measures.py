@@ -1,10 +1,10 @@
-"""How well a prior's appearance model explains heads that it has not seen: re-rendering on held-out views, and albedos
-against the truth, which neither the training nor the fit of the latents sees.
+"""Errors of a prior's appearance model on unseen heads: re-rendering of held-out views, and albedos against the truth,
+which neither the training nor the fit of the latents uses.
 
 Scores are dictionaries of numbers, keyed `[points_ or image_]quantity_measure`. Albedo scores come with two baselines:
 `constant_`, the training scenes' mean albedo everywhere, and `mean_`, the albedo field of the mean head. PSNR is in dB
-with peak 1; `_srgb` marks sRGB-coded values, `_scaled` one least-squares factor a channel, which takes out what the
-exposure leaves open. Specular albedo is measured as strength (reflectance at normal incidence F0 / 0.08) and as F0."""
+with peak 1; `_srgb` marks sRGB-coded values, `_scaled` one least-squares factor a channel, which removes the
+ambiguity of exposure. Specular albedo is measured as strength (reflectance at normal incidence F0 / 0.08) and as F0."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class LatentFit:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What training never sees of a scene; coordinates in scene units, colours and albedos linear."""
+    """The part of a scene that training never uses; coordinates in scene units, colours and albedos linear."""
 
     name: str
     source: str  # of the head, empty where the manifest has none
@@ -130,7 +130,7 @@ def fit_appearance_latents(
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
     """z_a, z_s and z_l [dim, S] of `scenes`, whose shape latents `z_sdf` [dim, S] are given, by the AF-SM's own losses
-    on the scenes' observations; everything else is frozen, and true albedo is never seen."""
+    on the scenes' observations; everything else is frozen, and true albedo is never used."""
     fit = fit or LatentFit()
     shape = {**avatar.tensors, "z_sdf": z_sdf}
     frozen = [
@@ -157,7 +157,7 @@ def fit_appearance_latents(
 
 
 def training_latents(appearance: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The latents [dim, scenes] of a finished training in the terms of its prior, whose latents are standard normal."""
+    """The latents [dim, scenes] of a finished training, whitened as those of its prior."""
     result = {}
     for name in af_sm.LATENTS:
         mean, spread = whitening(appearance[name])
@@ -167,7 +167,7 @@ def training_latents(appearance: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Factors:
-    """A fitted head taken apart at N surface points."""
+    """Albedos, irradiance and radiance of a fitted head at N surface points."""
 
     albedo: np.ndarray  # [3, N]
     specular: np.ndarray  # [1, N] reflectance at normal incidence

@@ -1,4 +1,4 @@
-"""Where the heads of a prior carry their landmarks, by scans of training heads: the tensors of
+"""Fits where a prior's heads carry their landmarks, from scans of training heads: the tensors of
 `sira_mi.avatar.landmark_model`."""
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ def add_landmark_model(prior: Avatar, found: Places) -> Avatar:
 
 
 def measure_held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
-    """Mean distance in mm of placed landmarks to the true ones, and of modelled ones, each head by what the others
-    tell. Raises InputError for too few heads."""
+    """Mean distance in mm to the true landmarks, of placed and of modelled ones, cross-validated over heads. Raises
+    InputError for too few heads."""
     count = len(found.placed)
     if count < 2 * _FOLDS:
         raise InputError(f"{count} training heads: {2 * _FOLDS} are needed")

@@ -20,6 +20,7 @@ from sira_mi.training.prior import whitening
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.train import APPEARANCE_TERMS, train_appearance
 from studies.cache import fingerprint, load_or_compute, read
+from studies.measures import spread_indices
 from studies.priors import appearance_measures as measures_of
 from studies.priors.appearance_measures import HeldOut, LatentFit
 from studies.priors.shape_measures import manifest_entries
@@ -59,12 +60,12 @@ def measure_appearance_prior(collection: Path, runs: Path, measures: AppearanceM
         prior = load_avatar(runs / "prior.safetensors")
         held_out, scenes, z_sdf = _test_scans(collection, evidence, measures.scans)
         scores = score_prior(prior, collection, held_out, scenes, z_sdf, measures.fit)
-        imaged = _spread(len(held_out), measures.imaged)
+        imaged = spread_indices(len(held_out), measures.imaged)
         views = {
             k: measures_of.render_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k]) for k in imaged
         }
         images = [measures_of.image_scores(views[k], held_out[k], scores["baseline"]) for k in imaged]
-        shown = [imaged[k] for k in _spread(len(imaged), measures.pictured)]
+        shown = [imaged[k] for k in spread_indices(len(imaged), measures.pictured)]
         write_png(picture, measures_of.appearance_sheet([held_out[k] for k in shown], [views[k][0] for k in shown]))
         return {
             "scans": len(held_out),
@@ -92,7 +93,7 @@ def score_prior(
     """`latents` [dim, S] of the scans, the `baseline` of training scenes, and the scores of each scan at points,
     `rows`."""
     train = manifest_entries(collection, "train")
-    chosen = [train[k] for k in _spread(len(train), _BASELINE_SCENES)]
+    chosen = [train[k] for k in spread_indices(len(train), _BASELINE_SCENES)]
     baseline = measures_of.training_baseline([_load(collection, entry) for entry in chosen])
     latents = measures_of.fit_appearance_latents(prior, scenes, z_sdf, AppearanceTraining(), fit)
     rows = [
@@ -138,7 +139,7 @@ def _test_scans(collection: Path, evidence: Path, limit: int) -> tuple[list[Held
     fits = stored["result"]
     place = {row["name"]: k for k, row in enumerate(fits["scans"])}
     entries = [entry for entry in manifest_entries(collection, "test") if Path(entry["file"]).name in place]
-    entries = [entries[k] for k in _spread(len(entries), limit)]
+    entries = [entries[k] for k in spread_indices(len(entries), limit)]
     columns = [place[Path(entry["file"]).name] for entry in entries]
     scenes = [load_scene(collection / Path(entry["file"]).name) for entry in entries]
     return [_load(collection, entry) for entry in entries], scenes, np.array(fits["w"], np.float32)[:, columns]
@@ -155,7 +156,7 @@ def _training_scores(prior: Avatar, collection: Path, runs: Path, count: int) ->
     return measures_of.mean_scores(
         [
             measures_of.render_scores(prior, _column(latents, k), z_sdf[:, k], _load(collection, entries[k]))
-            for k in _spread(len(entries), count)
+            for k in spread_indices(len(entries), count)
         ]
     )
 
@@ -169,8 +170,3 @@ def _load(collection: Path, entry: dict) -> HeldOut:
 
 def _column(latents: dict[str, np.ndarray], k: int) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(value[:, k]) for name, value in latents.items()}
-
-
-def _spread(count: int, limit: int) -> list[int]:
-    """At most `limit` indices evenly spread over range(count)."""
-    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int)).tolist()

@@ -1,4 +1,4 @@
-"""How far a SA-SM reaches: its latents fitted to unseen scans, random heads, landmarks in reference space.
+"""Measures of a SA-SM: latents fitted to unseen scans, random heads, landmarks in reference space.
 
 All distances are in mm between points and surfaces; nothing is aligned, the scans are in the model's own frame. The
 mean head, w = 0, is measured beside every fit.
@@ -31,7 +31,7 @@ from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.pictures import blank_tile, extracted_surface, head_tile
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.shape_model import ShapeModel
-from studies.measures import FACE_RADIUS, SHOULDERS, statistics
+from studies.measures import FACE_RADIUS, SHOULDERS, spread_indices, statistics
 
 DISC_RADIUS = 3.0  # mm: a scan is a disc of this radius at every point, across its normal
 VOXEL = 0.05  # of extracted meshes, scene units
@@ -79,8 +79,8 @@ def load_scans(collection: Path, nose: np.ndarray, limit: int | None = None) -> 
     entries = manifest_entries(collection, "test")
     if not entries:
         raise InputError(f"{collection} has no test scenes; build a larger collection")
-    if limit is not None and limit < len(entries):
-        entries = [entries[k] for k in np.linspace(0, len(entries) - 1, limit).round().astype(int)]
+    if limit is not None:
+        entries = [entries[k] for k in spread_indices(len(entries), limit)]
     scans = []
     for entry in entries:
         path = collection / Path(entry["file"]).name
@@ -120,8 +120,8 @@ def _latents(model: ShapeModel, name: str, w):
 def fit_shape(
     model: ShapeModel, scenes: Sequence[TrainingScene], fit: ShapeFit | None = None, seed: int = 0
 ) -> np.ndarray:
-    """w [k, S] of the shape latents that bring the surface nearest to each scene's scan, all scans at once, from the
-    mean head on; the networks stay as they are."""
+    """w [k, S] of the shape latents that fit the surface to each scene's scan, all scans at once, starting from the
+    mean head; the networks are fixed."""
     fit = fit or ShapeFit()
     size = model.bases["z_sdf"].shape[1]
     optimizer = adam({"w": np.zeros((size, len(scenes)), np.float32)}, {"w": fit.rate})

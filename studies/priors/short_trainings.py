@@ -1,4 +1,4 @@
-"""What each loss term and each size of the SA-SM is for: short trainings that differ in one thing, measured alike.
+"""Short trainings of the SA-SM that differ in one loss term or one size, all measured alike.
 
 The trainings are those of `python -m sira_mi.training shape`; each has its own folder and resumes from its checkpoint.
 """

@@ -7,12 +7,12 @@ import numpy as np
 
 from sira_mi.avatar.file import AvatarArchitecture
 from studies.cache import read
-from studies.markdown import average
+from studies.measures import average
 from studies.priors.shape_measures import DISC_RADIUS, REGIONS
 from studies.priors.short_trainings import COMPLETE, SIZES
 
 TRAITS = ("source", "ancestry", "sex", "age")
-# Scores of the appearance: name in the figures, where the measurement has it, its prefix, and its name there.
+# Scores of the appearance: name in the figures, then part, prefix and name in the measurement.
 APPEARANCE_SCORES = {
     "render_psnr": ("points", "", "render_psnr"),
     "training_render_psnr": ("training", "", "render_psnr"),
