@@ -8,7 +8,7 @@ from sira_mi.avatar.decoders import (
     albedo_refinement_cooperative,
     diffuse_albedo,
     diffuse_albedo_cooperative,
-    refined_albedo,
+    refine_albedo,
     specular_albedo,
     specular_albedo_cooperative,
 )
@@ -134,7 +134,7 @@ class NeuralAlbedo(mi.Texture):
         if self._packed_refinement is None:
             return base
         fine = albedo_refinement(self._refinement_network(), a.refinement_octaves, x_ref, gamma)
-        return refined_albedo(base, fine, mi.TensorXf(self.k_r, (1, 1)))
+        return refine_albedo(base, fine, mi.TensorXf(self.k_r, (1, 1)))
 
     def _pack(self) -> None:
         self._packed = pack(self._network())
@@ -166,7 +166,7 @@ class NeuralAlbedo(mi.Texture):
         if self._packed_refinement is None:
             return base
         fine = albedo_refinement_cooperative(self._packed_refinement, a.refinement_octaves, x_ref, gamma)
-        return [refined_albedo(b, r, self.k_r) for b, r in zip(base, fine, strict=True)]
+        return [refine_albedo(b, r, self.k_r) for b, r in zip(base, fine, strict=True)]
 
     def _look_up(self, si) -> list:
         if self._attribute is None:

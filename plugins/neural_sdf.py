@@ -157,7 +157,7 @@ class NeuralSDF(mi.Mesh):
             same_field = all(a.index == b.index for a, b in zip(parameters, then, strict=True))
             if same_field and all(np.array_equal(a, b) for a, b in zip(columns, rays, strict=True)):
                 return result
-        result = tracing.refined_hits(tracing.with_unit_gradient(self.field(), self._gradient_length), *columns)
+        result = tracing.refine_hits(tracing.with_unit_gradient(self.field(), self._gradient_length), *columns)
         self._last_hits = (columns, parameters, result) if columns[2].size <= CHUNK else None
         return result
 

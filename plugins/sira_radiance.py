@@ -1,13 +1,13 @@
 import drjit as dr
 import mitsuba as mi
 
-from sira_mi.avatar.decoders import rendered_radiance
+from sira_mi.avatar.decoders import render_radiance
 from sira_mi.avatar.file import load_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import from_columns, normalise, scatter_columns, to_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import signed_distance, surface
-from sira_mi.fields.tracing import closest_approach, differentiable_hit, refined_approach
+from sira_mi.fields.tracing import closest_approach, differentiable_hit, refine_approach
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
@@ -100,7 +100,7 @@ class SiraRadiance(mi.SamplingIntegrator):
             _, gradient, x_ref, gamma = surface(field, x)
             network = layers(self.architecture.networks["rendering"], self.rendering, self.z_r)
             octaves = self.architecture.rendering_octaves
-            radiance = rendered_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
+            radiance = render_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
             color = scatter_columns(radiance, index, width, mi.Color3f)
         mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
         return color, hit, [mask, closest]
@@ -117,7 +117,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         outline = dr.compress(inside & (dr.abs(head.grid(local.o + t * local.d, inside)) < OUTLINE))
         if dr.width(outline) > 0:
             columns = (to_columns(dr.gather(type(a), a, outline)) for a in (local.o, local.d, t))
-            dr.scatter(t, from_columns(refined_approach(field, *columns, head.voxel), mi.Float), outline)
+            dr.scatter(t, from_columns(refine_approach(field, *columns, head.voxel), mi.Float), outline)
             t = dr.clip(t, near, far)
         index = dr.compress(inside)
         closest = dr.full(mi.Float, FAR, width)

@@ -25,7 +25,7 @@ from sira_mi.optimisation.adam import (
 )
 from sira_mi.training import af_sm, sa_sm
 from sira_mi.training.loop import run_training
-from sira_mi.training.prior import assemble_prior, whitened, whitening
+from sira_mi.training.prior import assemble_prior, whiten, whitening
 from sira_mi.training.scenes import TrainingScene, load_scene, load_training_scenes
 
 
@@ -323,7 +323,7 @@ def test_the_whitened_network_takes_standard_normal_latents(name):
             return evaluate(layers(architecture, mi.Float(flat), latent), features).numpy()
         return evaluate(layers(architecture, mi.Float(flat)), latent).numpy()
 
-    moved = whitened(SMALL, name, flat, mean, spread)
+    moved = whiten(SMALL, name, flat, mean, spread)
     for z in (np.zeros(dimension), random(dimension, seed=2)):
         original = outputs(flat, mean + spread @ z)
         np.testing.assert_allclose(outputs(moved, z), original, atol=2e-5 * np.abs(original).max())

@@ -118,7 +118,7 @@ def test_illumination_decoder_gives_unit_axes_and_bounded_lobes(avatar):
 
 def test_refined_albedo_is_equation_11_within_its_range():
     base, fine = mi.TensorXf([[0.2, 0.9, 0.1]]), mi.TensorXf([[0.5, 0.5, -0.5]])
-    np.testing.assert_allclose(decoders.refined_albedo(base, fine, 0.4).numpy(), [[0.4, 1.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(decoders.refine_albedo(base, fine, 0.4).numpy(), [[0.4, 1.0, 0.0]], atol=1e-6)
 
 
 def test_several_latents_at_once_equal_single_evaluations(avatar):

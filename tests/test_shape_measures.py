@@ -11,13 +11,13 @@ import pytest
 from conftest import SMALL, small_avatar
 from test_training import SIZES, ball_collection
 
-from sira_mi.avatar.decoders import rendered_radiance
+from sira_mi.avatar.decoders import render_radiance
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.training import pictures, train
-from sira_mi.training.pictures import extracted_surface
+from sira_mi.training.pictures import extract_surface
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
 from studies.cache import fingerprint, load_or_compute, read
@@ -37,7 +37,7 @@ def scan_of(model, w, w_r, seed: int) -> Scan:
     """A scan of the model's own head `w`, in the model's own colours `w_r`, from one camera."""
     rng = np.random.default_rng(seed)
     field = model.field(model.latent("z_sdf", w))
-    points = shape_measures.surface_samples(field, extracted_surface(field), 3000, seed)
+    points = shape_measures.surface_samples(field, extract_surface(field), 3000, seed)
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x: surface(field, x), points.T)
     normals = gradient / np.linalg.norm(gradient, axis=0)
     centre = np.float32([[0, 0, 8]])
@@ -45,7 +45,7 @@ def scan_of(model, w, w_r, seed: int) -> Scan:
     rendering = model.layers_at("rendering", mi.TensorXf(model.latent("z_r", w_r)[:, None]))
     octaves = model.architecture.rendering_octaves
     (colors,) = evaluate_in_chunks(
-        lambda *inputs: rendered_radiance(rendering, octaves, *inputs), x_ref, normals, views.T, gamma
+        lambda *inputs: render_radiance(rendering, octaves, *inputs), x_ref, normals, views.T, gamma
     )
     scene = TrainingScene(
         points=points,
@@ -77,7 +77,7 @@ def own(model):
 def test_distance_to_the_surface_is_the_offset_from_it(model):
     """Points moved off the surface along its normals by up to 2 mm are as far from it as they were moved."""
     field = model.field(model.latent("z_sdf", np.zeros(SMALL.sdf_latent)))
-    on = shape_measures.surface_samples(field, extracted_surface(field), 500)
+    on = shape_measures.surface_samples(field, extract_surface(field), 500)
     f, gradient = evaluate_in_chunks(lambda x: surface(field, x)[:2], on.T)
     normals = (gradient / np.linalg.norm(gradient, axis=0)).T
     assert np.abs(f).max() < 2e-3
@@ -123,7 +123,7 @@ def plate(points) -> Scan:
 def test_surface_samples_are_even_and_on_the_surface(model):
     """On each side of the blob as many as its share of the area."""
     field = model.field(model.latent("z_sdf", np.zeros(SMALL.sdf_latent)))
-    extracted = extracted_surface(field)
+    extracted = extract_surface(field)
     points = shape_measures.surface_samples(field, extracted, 4000)
     (f,) = evaluate_in_chunks(lambda x: signed_distance(field, x), points.T)
     assert np.abs(f).max() < 5e-3

@@ -18,7 +18,7 @@ from sira_mi.optimisation.adam import adam, read_arrays
 from sira_mi.training import af_sm, pictures, sa_sm, train
 from sira_mi.training import loop as training
 from sira_mi.training.__main__ import main
-from sira_mi.training.loop import run_training, trained_parameters
+from sira_mi.training.loop import read_parameters, run_training
 from sira_mi.training.scenes import load_training_scenes
 from sira_mi.training.shape_model import ShapeModel
 
@@ -145,7 +145,7 @@ def test_the_terms_that_can_be_left_out_are_those_of_the_losses(collection):
 
 def test_so_are_those_of_the_appearance(collection, run):
     """All but the colour, whose weight is 1."""
-    shape, _ = trained_parameters(run / "shape.checkpoint")
+    shape, _ = read_parameters(run / "shape.checkpoint")
     settings = af_sm.AppearanceTraining(scenes=1, points=8, frozen_points=50)
     scene = load_training_scenes(collection)[0]
     frozen = af_sm.freeze_scene(SMALL, head_of(shape, 0), scene, settings, np.random.default_rng(0))
@@ -173,7 +173,7 @@ def test_sizes_replace_those_of_the_architecture():
 
 
 def test_the_command_trains_both_models_at_the_given_sizes(run, collection):
-    parameters, metadata = trained_parameters(run / "shape.checkpoint")
+    parameters, metadata = read_parameters(run / "shape.checkpoint")
     assert train.read_architecture(metadata, run / "shape.checkpoint") == SMALL
     assert metadata["step"] == "10" and parameters["z_sdf"].shape == (SMALL.sdf_latent, 3)
     assert load_avatar(run / "prior.safetensors").architecture == SMALL

@@ -26,7 +26,7 @@ def _logistic(a):
     return dr.rcp(1.0 + dr.exp(-a))
 
 
-def rendered_radiance(network: list[tuple], octaves: int, x_ref, normal, view, gamma):
+def render_radiance(network: list[tuple], octaves: int, x_ref, normal, view, gamma):
     """Eq. 4, r(x_ref, n, v, γ) [3, N]: `normal` and `view` (the unit direction in which the ray travels) are [3, N],
     γ is [N_γ, N]. The output is exponential, hence positive and unbounded."""
     h = evaluate(network, dr.concat([encode(x_ref, octaves), normal, view, gamma], axis=0))
@@ -48,7 +48,7 @@ def albedo_refinement(network: list[tuple], octaves: int, x_ref, gamma):
     return dr.tanh(evaluate(network, dr.concat([encode(x_ref, octaves), gamma], axis=0)))
 
 
-def refined_albedo(base, refinement, k_r):
+def refine_albedo(base, refinement, k_r):
     """Eq. 11, a + k_r a^r, kept within [0, 1]."""
     return dr.minimum(dr.maximum(base + k_r * refinement, 0.0), 1.0)
 
@@ -85,12 +85,12 @@ def illumination(network: list[tuple], latent):
     square = axis * axis
     length = dr.sqrt(square[:, 0:1, :] + square[:, 1:2, :] + square[:, 2:3, :] + 1e-8)
     axis = axis / in_three(length, axis=1)
-    sharpness = dr.exp(_bounded(h[:, 3:4, :] + float(np.log(INITIAL_SHARPNESS)), *LOG_SHARPNESS))
-    amplitude = dr.exp(_bounded(h[:, 4:7, :] - 1.0, *LOG_AMPLITUDE))
+    sharpness = dr.exp(_bound(h[:, 3:4, :] + float(np.log(INITIAL_SHARPNESS)), *LOG_SHARPNESS))
+    amplitude = dr.exp(_bound(h[:, 4:7, :] - 1.0, *LOG_AMPLITUDE))
     return dr.concat([axis, sharpness, amplitude], axis=1)
 
 
-def _bounded(a, lower: float, upper: float):
+def _bound(a, lower: float, upper: float):
     """Smooth clamp that is close to the identity in the middle of its range."""
     centre, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     return centre + half * dr.tanh((a - centre) / half)

@@ -73,11 +73,11 @@ def save_avatar(path: str | Path, avatar: Avatar) -> None:
         description["skin"] = dataclasses.asdict(avatar.skin)
     tensors = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in sorted(avatar.tensors.items())}
     data = save(tensors, metadata={"format": FORMAT, "avatar": json.dumps(description, sort_keys=True)})
-    data = _with_sorted_header(data)
+    data = _sort_header(data)
     write_through(path, lambda file: file.write_bytes(data))
 
 
-def _with_sorted_header(data: bytes) -> bytes:
+def _sort_header(data: bytes) -> bytes:
     """The same safetensors file, its header in a fixed order: the library writes metadata in an order that varies."""
     size = 8 + int.from_bytes(data[:8], "little")
     header = json.dumps(json.loads(data[8:size]), sort_keys=True, separators=(",", ":")).encode()

@@ -26,7 +26,7 @@ def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
     return known, evaluate_in_chunks(lambda p: deform(field, p)[0], mean[known].T)[0]
 
 
-def placed_landmarks(field: SdfField, x_ref, start):
+def place_landmarks(field: SdfField, x_ref, start):
     """Where the field maps to landmarks' places x_ref [3, L] in reference space: tensor [3, L], found by fixed-point
     steps from `start` [3, L]. Without gradients."""
     with dr.suspend_grad():
@@ -70,5 +70,5 @@ def landmarks_of(prior: Avatar, field: SdfField) -> np.ndarray:
     known, x_ref = reference_landmarks(prior)
     start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
     landmarks = np.full((len(known), 3), np.nan, np.float32)
-    landmarks[known] = LandmarkModel(prior)(placed_landmarks(field, x_ref, start)).numpy().T
+    landmarks[known] = LandmarkModel(prior)(place_landmarks(field, x_ref, start)).numpy().T
     return landmarks

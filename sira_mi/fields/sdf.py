@@ -58,7 +58,7 @@ def rigid_motion(pose):
     return dr.concat([dr.concat([*row, pose[3 + k : 4 + k, :]], axis=1) for k, row in enumerate(rows)], axis=0)
 
 
-def _moved(field: SdfField, x):
+def _move(field: SdfField, x):
     """Points [3, N] as the networks see them. One product: a broadcast's adjoint would be summed by atomics."""
     if field.motion is None:
         return x
@@ -67,7 +67,7 @@ def _moved(field: SdfField, x):
 
 def deform(field: SdfField, x):
     """Eqs 1 and 2a: x [3, N] -> (x_ref = x + δ [3, N], γ [N_γ, N])."""
-    x = _moved(field, x)
+    x = _move(field, x)
     h = evaluate(field.deformation, encode(x, field.octaves))
     return x + h[:3, :], h[3:, :]
 
@@ -85,7 +85,7 @@ def signed_distance(field: SdfField, x):
 
 
 def _with_tangents(field: SdfField, x, tangents: list):
-    x = _moved(field, x)
+    x = _move(field, x)
     if field.motion is not None:
         tangents = [field.motion[:, 0:3] @ t for t in tangents]
     h, t = evaluate_with_tangents(field.deformation, *encode_with_tangents(x, tangents, field.octaves))

@@ -28,7 +28,7 @@ _NO_CROSSING = 1e9
 # Where rays without a crossing are evaluated, scene units.
 _FAR = 1e4
 _ITERATIONS = 4
-# Evaluations of the field that a ray takes in `refined_hits`; three of them carry the slope along.
+# Evaluations of the field that a ray takes in `refine_hits`; three of them carry the slope along.
 MAXIMUM_EVALUATIONS = 3 * (1 + _ITERATIONS) + _SEARCH_SAMPLES
 
 
@@ -84,7 +84,7 @@ def with_unit_gradient(field: SdfField, length: float) -> SdfField:
     return replace(field, reference=[*field.reference[:-1], (weight / length, bias / length)])
 
 
-def refined_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
+def refine_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
     """The surface near the parameters t [1, N] of rays [3, N]: Newton steps; for rays that are not on it yet as many
     again, as thin features need; for those still off it Newton steps from their first crossing near t. Returns t and f
     [1, N] like `newton_hits`; a ray takes at most `MAXIMUM_EVALUATIONS`."""
@@ -184,7 +184,7 @@ def closest_approach(grid: DistanceGrid, origin, direction, t_near, t_far, activ
     return t
 
 
-def refined_approach(field: SdfField, origin, direction, t, step: float):
+def refine_approach(field: SdfField, origin, direction, t, step: float):
     """Ray parameters [1, N] of closest approaches near t: the vertices of parabolas through the field at t and `step`
     (scene units) to either side, moved by no more than that. Rays are [3, N]. Without gradients."""
     with dr.suspend_grad():

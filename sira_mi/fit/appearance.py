@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, light_refinement, refined_albedo
+from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, light_refinement, refine_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.decisions import Plan
 from sira_mi.fields.columns import evaluate_in_chunks, in_three
@@ -116,7 +116,7 @@ class AppearanceProblem:
             network = decoder(self.avatar, "albedo_refinement", current)
             x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
             fine = albedo_refinement(network, a.refinement_octaves, x_ref, gamma)
-            albedo = refined_albedo(base, fine, stage.k_r)
+            albedo = refine_albedo(base, fine, stage.k_r)
         shading = shade_points(self.avatar, current, k_s, points, albedo)
         target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
         radiance = shading.diffuse + shading.specular

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.file import Avatar
-from sira_mi.avatar.landmark_model import LandmarkModel, placed_landmarks, reference_landmarks
+from sira_mi.avatar.landmark_model import LandmarkModel, place_landmarks, reference_landmarks
 from sira_mi.avatar.shape import POSE, SHAPE_LATENTS, SHAPE_NETWORKS, SHAPE_PARAMETERS, HeadShape
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_columns
@@ -102,7 +102,7 @@ class GeometryProblem:
         self._fixed = {name: mi.Float(tensors[name]) for name in _PARAMETERS}
         if self.landmarks is not None:
             field = replace(self._field(self._fixed), motion=None)
-            self.landmarks["placed"] = placed_landmarks(field, self.landmarks["x_ref"], self.landmarks["x"])
+            self.landmarks["placed"] = place_landmarks(field, self.landmarks["x_ref"], self.landmarks["x"])
 
     def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
         return self._losses_of(self._field({**self._fixed, **tensors}), tensors, stage, step, rng)

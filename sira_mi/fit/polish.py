@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from skimage.transform import resize_local_mean
 
-from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, refined_albedo, specular_albedo
+from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, refine_albedo, specular_albedo
 from sira_mi.avatar.file import Avatar, load_avatar
 from sira_mi.export.scene import head, head_scene, sensor, sg_light
 from sira_mi.fields.columns import evaluate_in_chunks
@@ -102,7 +102,7 @@ class PolishProblem:
         fine = albedo_refinement(decoder(self.avatar, "albedo_refinement", tensors), a.refinement_octaves, x_ref, gamma)
         specular = decoder(self.avatar, "specular_albedo", tensors, "z_s")
         result = {
-            "diffuse": refined_albedo(base, fine, k_r),
+            "diffuse": refine_albedo(base, fine, k_r),
             "specular": specular_albedo(specular, a.specular_octaves, x_ref),
             "lobes": decode_lobes(self.avatar, tensors),
         }

@@ -5,6 +5,8 @@ from operator import add
 
 import drjit as dr
 
+from sira_mi.fields.columns import in_three
+
 
 def _norm(v, epsilon: float = 1e-8):
     """Length [1, N] of the columns of v [rows, N]; smooth at zero."""
@@ -57,6 +59,20 @@ def landmark_loss(x_ref, scenes: int):
 def embedding_loss(*latents):
     """L_Emb of eqs 7 and 10: mean over scenes of the sum of ‖z‖² over `latents` [dim, S]."""
     return reduce(add, (mean(dr.sum(z * z, axis=0)) for z in latents))
+
+
+def smoothness_loss(values, moved):
+    """L_Reg of eq. 10: mean absolute difference of a field's values at points and at points moved a little, both
+    [rows, N]."""
+    return mean(dr.abs(values - moved))
+
+
+def white_light_loss(amplitude):
+    """Mean squared log-chroma of the amplitudes [N_l, 3] or [N_l, 3, S] of a light's lobes: 0 for grey light."""
+    logarithm = dr.log(amplitude)
+    grey = dr.reshape(dr.mean(logarithm, axis=1), (logarithm.shape[0], 1, *logarithm.shape[2:]))
+    chroma = logarithm - in_three(grey, axis=1)
+    return mean(chroma * chroma)
 
 
 def squared_norm(*latents):

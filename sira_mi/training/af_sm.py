@@ -17,7 +17,7 @@ from sira_mi.avatar.decoders import SKIN_SPECULAR, diffuse_albedo, illumination,
 from sira_mi.avatar.shape import HeadShape
 from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import evaluate_in_chunks, in_three, unit_columns
+from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.optimisation import losses
@@ -191,16 +191,13 @@ def appearance_losses(architecture, settings: AppearanceTraining, parameters: di
     material = Material(albedo, specular, settings.roughness, 1.0)
     diffuse_part, specular_part = radiance_of_scenes(batch.normals, batch.views, material, lobes, batch.count)
     skin = diffuse_albedo(diffuse, architecture.albedo_octaves, batch.skin_x_ref, batch.skin_gamma)
-    difference = albedo - moved
     anchor = dr.log(specular / batch.specular_level)
-    amplitude = dr.log(lobes[:, 4:7, :])
-    grey = amplitude - in_three(dr.reshape(dr.mean(amplitude, axis=1), (-1, 1, batch.count)), axis=1)
     return {
         "color": losses.photometric_loss(diffuse_part + specular_part, batch.colors),
         "embedding": losses.embedding_loss(z_a, z_s, z_l),
-        "smoothness": losses.mean(dr.abs(difference)),
+        "smoothness": losses.smoothness_loss(albedo, moved),
         "specular_anchor": losses.mean(anchor * anchor),
-        "white_light": losses.mean(grey * grey),
+        "white_light": losses.white_light_loss(lobes[:, 4:7, :]),
         "skin_tone": settings.skin.loss(skin, batch.skin_weight, settings.skin.tone_in_photo(batch.skin_radiance)),
     }
 

@@ -54,7 +54,7 @@ class Divergence:
         return float(np.median(list(self._losses)[-_RECENT:])) <= _SOUND * self.best
 
 
-def trained_parameters(checkpoint: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def read_parameters(checkpoint: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The parameters in a checkpoint of `run_training` and its metadata: `step`, and what the training was described
     by. Raises InputError when it cannot be read."""
     state, metadata = read_arrays(checkpoint)

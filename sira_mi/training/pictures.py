@@ -58,7 +58,7 @@ def _crossings(grid: np.ndarray, spacing: float, view: np.ndarray) -> tuple[np.n
     return hit, view.T @ (axes @ np.stack([row, column, depth]) + corner[:, None])
 
 
-def _padded(points: np.ndarray, multiple: int = 2048) -> np.ndarray:
+def _pad(points: np.ndarray, multiple: int = 2048) -> np.ndarray:
     """Points [3, M] with the last repeated up to a multiple, so that few kernels serve all pictures."""
     return np.pad(points, ((0, 0), (0, -points.shape[1] % multiple)), mode="edge").astype(np.float32)
 
@@ -68,7 +68,7 @@ def blank_tile() -> np.ndarray:
     return np.full((*TILE, 3), _BACKGROUND, np.float32)
 
 
-def extracted_surface(field: SdfField, voxel: float = _VOXEL) -> ExtractedSurface:
+def extract_surface(field: SdfField, voxel: float = _VOXEL) -> ExtractedSurface:
     """The field's zero level set on a grid of spacing `voxel`, scene units. Raises EmptySurfaceError."""
     return extract(lambda p: evaluate_in_chunks(lambda x: signed_distance(field, x), p)[0][0], voxel)
 
@@ -78,18 +78,18 @@ def head_tile(field: SdfField, extracted: ExtractedSurface | None = None, yaw: f
     `extracted` is the field's surface if it is known already."""
     tile, view = blank_tile(), yaw_rotation(yaw)
     try:
-        extracted = extracted or extracted_surface(field)
+        extracted = extracted or extract_surface(field)
     except EmptySurfaceError:
         return tile
     hit, points = _crossings(extracted.grid, extracted.spacing, view)
     count = points.shape[1]
     if count == 0:
         return tile
-    f, gradient = evaluate_in_chunks(lambda x: surface(field, x)[:2], _padded(points))
+    f, gradient = evaluate_in_chunks(lambda x: surface(field, x)[:2], _pad(points))
     ray = -view[2][:, None]
     slope = np.minimum((ray * gradient).sum(axis=0), -0.1)
     moved = points + ray * np.clip(-f[0] / slope, -_VOXEL, _VOXEL)[:count]
-    (gradient,) = evaluate_in_chunks(lambda x: surface(field, x)[1], _padded(moved))
+    (gradient,) = evaluate_in_chunks(lambda x: surface(field, x)[1], _pad(moved))
     normals = unit_columns(gradient[:, :count])
     closing = (moved <= np.array(DOMAIN_LOWER)[:, None] + 0.02) | (moved >= np.array(DOMAIN_UPPER)[:, None] - 0.02)
     grey = np.where(closing.any(axis=0), 0.5, _shade(normals, view))
@@ -167,11 +167,11 @@ class AppearancePicture:
         the next scene."""
         column = {name: parameters[name][:, self.chosen] for name in ("z_a", "z_s", "z_l")}
         network = self.architecture.networks
-        lobes = illumination(_unpacked(network, parameters, "illumination"), mi.TensorXf(column["z_l"]))
+        lobes = illumination(_unpack(network, parameters, "illumination"), mi.TensorXf(column["z_l"]))
         rows = []
         for k, (points, frozen) in enumerate(zip(self.points, self.frozen, strict=True)):
-            diffuse = _unpacked(network, parameters, "diffuse_albedo", column["z_a"][:, k])
-            specular = _unpacked(network, parameters, "specular_albedo", column["z_s"][:, k])
+            diffuse = _unpack(network, parameters, "diffuse_albedo", column["z_a"][:, k])
+            specular = _unpack(network, parameters, "specular_albedo", column["z_s"][:, k])
             lights = [lobes[:, :, k], lobes[:, :, (k + 1) % len(self.points)]]
             away = -yaw_rotation(YAW)[2].astype(np.float32)
 
@@ -189,6 +189,6 @@ class AppearancePicture:
         write_png(path, sheet(rows))
 
 
-def _unpacked(networks, parameters, name: str, latent: np.ndarray | None = None) -> list[tuple]:
+def _unpack(networks, parameters, name: str, latent: np.ndarray | None = None) -> list[tuple]:
     latent = None if latent is None else mi.TensorXf(np.ascontiguousarray(latent[:, None]))
     return layers(networks[name], mi.Float(parameters[name]), latent)

@@ -20,7 +20,7 @@ def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, directions * padded
 
 
-def whitened(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def whiten(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Network parameters that take a standard normal latent z for what `mean + spread z` was. A latent that shifts
     hidden layers: in each of them Z mean is added to the bias, and Z spread takes the place of Z. A latent that is the
     network's input (the illumination decoder's): the same in the first layer, with its weights."""
@@ -65,7 +65,7 @@ def assemble_prior(
     tensors = {name: shape[name] for name in sa_sm.NETWORKS} | {name: appearance[name] for name in af_sm.NETWORKS}
     latents = {**shape, **appearance}
     for name, network in owners.items():
-        tensors[network] = whitened(architecture, network, tensors[network], *whitening(latents[name]))
+        tensors[network] = whiten(architecture, network, tensors[network], *whitening(latents[name]))
     for name, size in architecture.latents.items():
         tensors[name] = np.zeros(size, np.float32)
     rng = np.random.default_rng([seed, 4])

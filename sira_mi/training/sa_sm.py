@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.architecture import AvatarArchitecture
-from sira_mi.avatar.decoders import rendered_radiance
+from sira_mi.avatar.decoders import render_radiance
 from sira_mi.avatar.shape import SHAPE_LATENTS, SHAPE_NETWORKS, HeadShape
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import normalise
@@ -149,7 +149,7 @@ def shape_losses(architecture: AvatarArchitecture, parameters: dict, batch: Shap
     points = _columns_of(batch.points, batch.count, 0, n)
     rendering = layers(networks["rendering"], parameters["rendering"], latents["z_r"])
     octaves = architecture.rendering_octaves
-    radiance = rendered_radiance(rendering, octaves, x_ref, normalise(gradient), batch.views, gamma)
+    radiance = render_radiance(rendering, octaves, x_ref, normalise(gradient), batch.views, gamma)
     return {
         "surface": losses.surface_loss(f),
         "normal": losses.normal_loss(gradient, batch.normals),

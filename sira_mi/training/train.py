@@ -160,7 +160,7 @@ def train_appearance(
     from sira_mi.avatar.shape import head_of
     from sira_mi.optimisation.adam import adam
     from sira_mi.training import af_sm
-    from sira_mi.training.loop import run_training, trained_parameters
+    from sira_mi.training.loop import read_parameters, run_training
     from sira_mi.training.pictures import AppearancePicture
     from sira_mi.training.prior import assemble_prior
     from sira_mi.training.sa_sm import LATENTS, NETWORKS
@@ -170,7 +170,7 @@ def train_appearance(
     checkpoint = out / "shape.checkpoint"
     if not checkpoint.exists():
         raise InputError(f"{checkpoint} is missing; run python -m sira_mi.training shape first")
-    shape, metadata = trained_parameters(checkpoint)
+    shape, metadata = read_parameters(checkpoint)
     trained = read_architecture(metadata, checkpoint)
     architecture = with_sizes(trained, sizes or {})
     frozen_sizes = ("features", "sdf_", "rendering_")

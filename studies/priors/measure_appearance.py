@@ -15,7 +15,7 @@ from sira_mi.avatar.file import Avatar, load_avatar
 from sira_mi.errors import InputError
 from sira_mi.files import write_png
 from sira_mi.training.af_sm import AppearanceTraining
-from sira_mi.training.loop import trained_parameters
+from sira_mi.training.loop import read_parameters
 from sira_mi.training.prior import whitening
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.train import APPEARANCE_TERMS, train_appearance
@@ -148,7 +148,7 @@ def _test_scans(collection: Path, evidence: Path, limit: int) -> tuple[list[Held
 def _training_scores(prior: Avatar, collection: Path, runs: Path, count: int) -> dict[str, float]:
     """Re-rendering of held-out views of training scenes with the latents of the training."""
     _, shape = read_model(runs / "shape.checkpoint")
-    appearance, _ = trained_parameters(runs / "appearance.checkpoint")
+    appearance, _ = read_parameters(runs / "appearance.checkpoint")
     mean, spread = whitening(shape["z_sdf"])
     z_sdf = (np.linalg.pinv(spread) @ (shape["z_sdf"] - mean[:, None])).astype(np.float32)
     latents = measures_of.training_latents(appearance)

@@ -13,7 +13,7 @@ from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_png
-from sira_mi.training.pictures import extracted_surface, head_tile, scan_tile, sheet
+from sira_mi.training.pictures import extract_surface, head_tile, scan_tile, sheet
 from sira_mi.training.shape_model import ShapeModel
 from studies.cache import fingerprint, load_or_compute
 from studies.priors import shape_measures
@@ -123,7 +123,7 @@ def _fits(model: ShapeModel, scans: list[Scan], measures: Measures, picture: Pat
 def _surface_points(field, count: int) -> np.ndarray:
     """Points [count, 3] on a field's surface above the shoulders; none where there is no surface."""
     try:
-        return shape_measures.surface_samples(field, extracted_surface(field, shape_measures.VOXEL), count)
+        return shape_measures.surface_samples(field, extract_surface(field, shape_measures.VOXEL), count)
     except EmptySurfaceError:
         return np.zeros((0, 3), np.float32)
 

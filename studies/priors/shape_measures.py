@@ -19,7 +19,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sira_mi.avatar.decoders import rendered_radiance
+from sira_mi.avatar.decoders import render_radiance
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
@@ -28,7 +28,7 @@ from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.optimisation import losses
 from sira_mi.optimisation.adam import adam, cosine_fall
 from sira_mi.portrait.landmarks import NOSE_TIP
-from sira_mi.training.pictures import blank_tile, extracted_surface, head_tile
+from sira_mi.training.pictures import blank_tile, extract_surface, head_tile
 from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.shape_model import ShapeModel
 from studies.measures import FACE_RADIUS, SHOULDERS, spread_indices, statistics
@@ -161,7 +161,7 @@ def color_errors(
     def radiance(w_r, index):
         parts = [mi.TensorXf(np.ascontiguousarray(a[:, :, index].reshape(len(a), -1), np.float32)) for a in arrays]
         rendering = model.layers_at("rendering", _latents(model, "z_r", w_r))
-        return rendered_radiance(rendering, model.architecture.rendering_octaves, *parts[:4]), parts[4]
+        return render_radiance(rendering, model.architecture.rendering_octaves, *parts[:4]), parts[4]
 
     size = model.bases["z_r"].shape[1]
     optimizer = adam({"w": np.zeros((size, len(scans)), np.float32)}, {"w": 0.1})
@@ -274,7 +274,7 @@ def random_heads(model: ShapeModel, sigma: float, count: int, seed: int = 0) -> 
         w = sigma * normal
         field = model.field(model.latent("z_sdf", w))
         try:
-            extracted = extracted_surface(field, VOXEL)
+            extracted = extract_surface(field, VOXEL)
         except EmptySurfaceError:
             rows.append({"parts": 0, "largest": 0.0, "gradient": 0.0})
             tiles.append(blank_tile())

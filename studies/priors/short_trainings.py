@@ -22,7 +22,7 @@ from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import NOSE_TIP
-from sira_mi.training.loop import trained_parameters
+from sira_mi.training.loop import read_parameters
 from sira_mi.training.scenes import TrainingScene, load_training_scenes
 from sira_mi.training.shape_model import ShapeModel
 from sira_mi.training.train import SHAPE_TERMS, read_architecture, train_shape
@@ -69,7 +69,7 @@ def architectures() -> dict[str, dict[str, int]]:
 
 def read_model(checkpoint: Path) -> tuple[ShapeModel, dict[str, np.ndarray]]:
     """A trained SA-SM and its parameters from a checkpoint of the train command. Raises InputError."""
-    parameters, metadata = trained_parameters(checkpoint)
+    parameters, metadata = read_parameters(checkpoint)
     return ShapeModel.of_training(read_architecture(metadata, checkpoint), parameters), parameters
 
 

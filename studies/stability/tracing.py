@@ -295,7 +295,7 @@ def _measure_hand_made(name: str, field: SdfField, origin, direction, start, fou
     """Rays that all meet the field, traced from `start` [n]; finding less than a share of `found` is an infinite
     error."""
     columns = [np.ascontiguousarray(a, np.float32) for a in (origin, direction, start[None])]
-    t, f = tracing.refined_hits(field, *columns)
+    t, f = tracing.refine_hits(field, *columns)
     hit = np.abs(f[0]) < tracing.HIT_TOLERANCE
     reference = Field64.of(field)
     o, d = (c.astype(np.float64)[:, hit] for c in columns[:2])
@@ -358,7 +358,7 @@ def count_evaluations(quick: bool) -> Row:
             mock.patch.object(tracing, "signed_distance", wraps=tracing.signed_distance) as value,
             mock.patch.object(tracing, "signed_distance_and_slope", wraps=tracing.signed_distance_and_slope) as slope,
         ):
-            t, f = tracing.refined_hits(field, *columns)
+            t, f = tracing.refine_hits(field, *columns)
         columns_evaluated = sum(call.args[1].shape[1] for spy in (value, slope) for call in spy.call_args_list)
         calls = max(calls, columns_evaluated / count)
         bad += count_non_finite(t, f)
@@ -384,7 +384,7 @@ def count_hits_of_empty_sets(quick: bool) -> Row:
     rng, count = np.random.default_rng(40), 1000
     origin, direction = draw_camera_rays(rng, count, 6.0, 40.0)
     columns = origin.astype(np.float32), direction.astype(np.float32), np.full((1, count), 6.0, np.float32)
-    t, f = tracing.refined_hits(field, *columns)
+    t, f = tracing.refine_hits(field, *columns)
     return Row(
         "empty zero sets",
         "heads and rays",
