@@ -6,6 +6,7 @@ import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 import dataclasses
 import json
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from conftest import camera
 
 from sira_mi.export import scene as scenes
-from studies.crosscheck import causes, curves, forms, images, page, speed
+from studies.crosscheck import causes, curves, forms, images, page, plots, speed
 from studies.crosscheck.__main__ import _command, main
 from studies.crosscheck.case import Case, load_case
 from studies.crosscheck.fits import read_fits
@@ -21,6 +22,7 @@ from studies.crosscheck.lights import SETTINGS, SOFT, lobes_of
 from studies.crosscheck.points import field_points, in_double, mesh_points
 from studies.crosscheck.regions import HEAD, REGIONS, SILHOUETTE, regions
 from studies.crosscheck.run import Settings, measure
+from studies.data import read_figures, write_figures
 from sira_mi.errors import InputError
 
 pytest.importorskip("flip_evaluator")
@@ -204,23 +206,55 @@ TINY = Settings(minutes=0.0, voxel=VOXEL, usual_voxel=0.2, pass_samples=2, side=
 
 
 @pytest.mark.slow
-def test_a_tiny_run_writes_the_page(case, tmp_path):
-    measured = measure(case, {SOFT: lobes_of(SOFT)}, TINY, lambda line: None)
+def test_a_tiny_run_gives_figures_plots_and_page(case, tmp_path):
+    """Figures, plots and page of one light; kept evidence is not measured again."""
+    lights, evidence = {SOFT: lobes_of(SOFT)}, tmp_path / "evidence"
+    measured, lit = measure(case, lights, TINY, lambda line: None, evidence)
+    again, _ = measure(case, lights, TINY, lambda line: None, evidence)
+    assert again["lights"] == json.loads(json.dumps(measured["lights"]))
     rows = tmp_path / "draft" / "rows.json"
     rows.parent.mkdir()
     rows.write_text(json.dumps(fit_rows()))
-    written = page.write_page(tmp_path, measured, read_fits([rows]), "python -m studies.crosscheck --size 20")
-    text = written.read_text(encoding="utf-8")
-    assert "--size 20" in text and "time over before" in text and "| draft | 2 | 30 | 1.50 | 31.0 |" in text
-    assert all(f"({name}" in text for name in ("images/crosscheck_curves.svg", "images/crosscheck_causes.png"))
+    fits = {"rows": [dataclasses.asdict(fit) for fit in read_fits([rows])]}
+    file = tmp_path / page.FIGURES
+    figures = write_figures(file, {"command": "python -m studies.crosscheck --size 20", **measured, "fits": fits})
+    text = page.write_page(figures, tmp_path).read_text(encoding="utf-8")
+    assert text == page.render_page(read_figures(file)), "the page is a function of the JSON file"
+    assert "--size 20" in text and "| draft | 2 | 30 | 1.50 | 31.0 |" in text and "Not measured (`--no-speed`)" in text
     assert all(cause in text for cause in (causes.PROXY, causes.FLOAT32, causes.NOISE, causes.REST))
-    head = (tmp_path / "crosscheck" / "curves.csv").read_text().splitlines()[0]
-    assert head == "light,method,samples,seconds,error,flip"
-    svg = (tmp_path / "images" / "crosscheck_curves.svg").read_text()
-    assert svg.lstrip().startswith("<?xml") and "slope" in svg and curves.PATH in svg
-    assert mi.Bitmap(str(tmp_path / "images" / "crosscheck_causes.png")).size()[0] > 400
-    points = {(p.method, p.samples): p.error for p in measured.lit[0].points}
+    assert "NaN" not in file.read_text() and "Infinity" not in file.read_text()
+    points = {(p["method"], p["samples"]): p["error"] for p in figures["lights"][0]["points"]}
     assert points[curves.PATH, 1] > points[curves.PATH, 16] > 0
+
+    plots.plot_curves([curves.Point(**p) for p in figures["lights"][0]["points"]], tmp_path / "curves.svg")
+    svg = (tmp_path / "curves.svg").read_text()
+    assert svg.lstrip().startswith("<?xml") and "slope" in svg and curves.PATH in svg
+    plots.plot_sheet(lit, tmp_path / "causes.png")
+    assert mi.Bitmap(str(tmp_path / "causes.png")).size()[0] > 400
+
+
+def test_the_page_in_docs_is_that_of_its_figures():
+    """`docs/crosscheck.md` is `docs/data/crosscheck.json` in the template, in at most 1,500 words; no field is left."""
+    docs = Path(__file__).resolve().parent.parent / "docs"
+    text = (docs / "crosscheck.md").read_text(encoding="utf-8")
+    assert text == page.render_page(read_figures(docs / page.FIGURES)), "run python -m studies.crosscheck --page"
+    assert len(text.split()) <= 1500 and "$" not in text
+
+
+def test_a_missed_mark_is_called_missed():
+    """Verdicts follow the figures: each mark alone turns when its figure passes the bound."""
+    docs = Path(__file__).resolve().parent.parent / "docs"
+    figures = read_figures(docs / page.FIGURES)
+    marks = page.render_page(figures).split("## Marks")[1].split("## ")[0]
+    worse = json.loads(json.dumps(figures))
+    for row in worse["lights"][0]["causes"]:
+        row["errors"]["head"] *= 10
+    for ratio in worse["speed"]["ratios"]:
+        ratio["value"] *= 10
+    for point in worse["lights"][1]["points"]:
+        point["error"] = 0.1
+    changed = page.render_page(worse).split("## Marks")[1].split("## ")[0]
+    assert changed.count("missed") == marks.count("missed") + 3
 
 
 def fit_rows():
@@ -317,8 +351,6 @@ def test_rows_of_fits_that_are_none(tmp_path):
 
 
 def test_plots_say_which_extra_is_missing(monkeypatch):
-    from studies.crosscheck import plots
-
     for module in ("matplotlib", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, module, None)
     for need in (plots.pyplot, images.require_flip):

@@ -1,1 +1,1 @@
-"""Cross-validation of closed-form shading with path tracing (`python -m studies.crosscheck`)."""
+"""Cross-check of closed forms against path tracing (`python -m studies.crosscheck`)."""

@@ -1,16 +1,18 @@
-"""`python -m studies.crosscheck [AVATAR|SCENE] [--out docs]`: closed forms against path tracing, written as a page."""
+"""`python -m studies.crosscheck [AVATAR|SCENE] [--out docs]`: closed forms against path tracing, as JSON and a page."""
 
 import argparse
 import math
 import shlex
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from sira_mi.errors import CommandParser, InputError, run_command
 
 _DESCRIPTION = """\
-Renders one head under several lights by closed forms and by path tracing, splits their difference into its causes,
-measures error against run time and the speed of the plugins, and writes OUT/crosscheck.md with CSV files and figures.
+Renders one head under several lights in closed form and by path tracing, splits their difference into its causes, and
+measures error against time and the speed of the plugins. Writes OUT/data/crosscheck.json, and from it OUT/crosscheck.md
+and OUT/images/crosscheck_*.
 
 AVATAR is the output folder of a fit or an avatar.safetensors, SCENE an .xml with a neural_sdf, a sira_bsdf and an
 sg_envmap, whose own light is measured too; without either it is the mean head of the shipped prior."""
@@ -37,8 +39,9 @@ def _parser() -> argparse.ArgumentParser:
         "--fits", nargs="+", type=Path, default=(), metavar="ROWS", help="rows.json of evaluate fits, one a quality"
     )
     parser.add_argument(
-        "--evidence", type=Path, metavar="DIR", help="keep what is measured of each light there; a new run goes on"
+        "--evidence", type=Path, metavar="DIR", help="keep what is measured of each light there; a new run resumes"
     )
+    parser.add_argument("--page", action="store_true", help="write the page from OUT/data/crosscheck.json alone")
     parser.add_argument("--no-speed", action="store_true", help="leave the ratios and costs out")
     parser.add_argument("--seed", type=int, default=0, help="of all random numbers")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant")
@@ -76,22 +79,27 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     _check(options)
 
-    from studies.crosscheck.lights import SETTINGS
-
-    names = tuple(SETTINGS)
-    if unknown := set(options.lights or ()) - set(names):
-        raise InputError(f"unknown lights {', '.join(sorted(unknown))}; known are {', '.join(names)}")
-
     from sira_mi.variants import set_variant
 
     set_variant(options.variant)
+    from studies.crosscheck import page
+    from studies.data import read_figures, write_figures
+
+    file = options.out / page.FIGURES
+    if options.page:
+        print(page.write_page(read_figures(file), options.out))
+        return 0
+
     from studies.crosscheck.case import load_case
+    from studies.crosscheck.curves import Point
     from studies.crosscheck.fits import read_fits
     from studies.crosscheck.images import require_flip
-    from studies.crosscheck.page import write_page
-    from studies.crosscheck.plots import pyplot
-    from studies.crosscheck.run import Settings, measure, settings_of_light
+    from studies.crosscheck.lights import SETTINGS
+    from studies.crosscheck.plots import plot_curves, plot_fits, plot_sheet, pyplot
+    from studies.crosscheck.run import Settings, choose_lights, measure
 
+    if unknown := set(options.lights or ()) - set(SETTINGS):
+        raise InputError(f"unknown lights {', '.join(sorted(unknown))}; known are {', '.join(SETTINGS)}")
     pyplot()
     require_flip()
     fits = read_fits(options.fits)
@@ -104,10 +112,16 @@ def main(arguments: list[str] | None = None) -> int:
         seed=options.seed,
         speed=not options.no_speed,
     )
-    lights = settings_of_light(case, tuple(options.lights or ()), names)
-    measured = measure(case, lights, settings, lambda line: print(line, flush=True), options.evidence)
-    path = write_page(options.out, measured, fits, _command(arguments))
-    print(f"{path} written after {measured.seconds:.0f} s")
+    lights = choose_lights(case, tuple(options.lights or ()))
+    measured, lit = measure(case, lights, settings, lambda line: print(line, flush=True), options.evidence)
+    rows = {"rows": [asdict(fit) for fit in fits]}
+    figures = write_figures(file, {"command": _command(arguments), **measured, "fits": rows})
+    images = options.out / "images"
+    plot_curves([Point(**point) for one in lit for point in one.figures["points"]], images / "crosscheck_curves.svg")
+    plot_sheet(lit, images / "crosscheck_causes.png")
+    if fits:
+        plot_fits(fits, images / "crosscheck_fits.svg")
+    print(page.write_page(figures, options.out))
     return 0
 
 

@@ -45,10 +45,11 @@ class Row:
     light: str
     form: str  # PHYSG, FORM or VISIBLE
     cause: str
-    errors: dict[str, float]  # root mean square by region, share of the head's mean radiance, without noise
+    # Root mean square by region, share of the head's mean radiance, without noise; None for a region without pixels.
+    errors: dict[str, float | None]
     bias: float  # mean over the head, share of its mean radiance; adds up to the total's
-    share: float  # of the total's mean square over the head; adds up to 1, NaN for what is no part of the total
-    resolution: float = float("nan")  # the error over the head that noise alone may show
+    share: float | None  # of the total's mean square over the head; adds up to 1, None for what is beside the total
+    resolution: float | None = None  # the error over the head that noise alone may show
 
 
 def gather(case: Case, reference: mi.Shape, usual: mi.Shape, side: int, seed: int) -> list[Half]:
@@ -156,11 +157,11 @@ def rows(
     result = []
     for cause, part in named.items():
         errors = {
-            region: root(mean_square(part[0], part[1], regions[region])) / level if regions[region].any() else np.nan
+            region: root(mean_square(part[0], part[1], regions[region])) / level if regions[region].any() else None
             for region in (*REGIONS, HEAD)
         }
         common = 0.5 * (mean_square(part[0], total[1], head) + mean_square(part[1], total[0], head))
-        share = common / square if square > 0 else np.nan
+        share = common / square if square > 0 else None
         least = resolution(part[0], part[1], head) / level
         result.append(Row(light, form, cause, errors, float(part[:, head].mean()) / level, share, least))
     return result
@@ -170,10 +171,10 @@ def noise_row(light: str, reference: Estimate, regions: Mapping[str, np.ndarray]
     """What noise is left in the mean of the reference's halves, by region."""
     half = 0.5 * (reference.halves[0] - reference.halves[1])
     errors = {
-        region: float(np.sqrt((half[regions[region]] ** 2).mean())) / level if regions[region].any() else np.nan
+        region: float(np.sqrt((half[regions[region]] ** 2).mean())) / level if regions[region].any() else None
         for region in (*REGIONS, HEAD)
     }
-    return Row(light, "", NOISE, errors, 0.0, np.nan)
+    return Row(light, "", NOISE, errors, 0.0, None)
 
 
 def usual_row(light: str, pictures: Pictures, regions: Mapping[str, np.ndarray], level: float, voxel: float) -> Row:
@@ -181,4 +182,4 @@ def usual_row(light: str, pictures: Pictures, regions: Mapping[str, np.ndarray],
     part = pictures.usual - pictures.arriving
     name = f"beside the sum: a mesh of {voxel:g} instead of the field"
     row = rows(light, "", {name: part, TOTAL: part}, regions, level)[0]
-    return Row(light, "", name, row.errors, row.bias, np.nan, row.resolution)
+    return Row(light, "", name, row.errors, row.bias, None, row.resolution)

@@ -1,4 +1,4 @@
-"""The figures of the page, by Matplotlib, an optional package."""
+"""The plots of the page, by Matplotlib, an optional package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from sira_mi.portrait.load import linear_to_srgb
 from studies.crosscheck import curves
 from studies.crosscheck.evidence import Lit
 from studies.crosscheck.fits import FitPoint
-from studies.crosscheck.regions import REGIONS
+from studies.crosscheck.page import DIFFERENCE_RANGE
+from studies.crosscheck.regions import HEAD, REGIONS
 
 # Colour and marker of each method.
 _STYLE = {
@@ -28,8 +29,6 @@ _STYLE = {
     curves.PATH: ("tab:blue", "."),
 }
 _REGION_COLOURS = ((0.95, 0.85, 0.5), (0.3, 0.7, 0.4), (0.25, 0.3, 0.7), (0.85, 0.2, 0.2))
-# A difference of this share of the mean radiance has the strongest colour.
-DIFFERENCE_RANGE = 0.3
 
 
 def pyplot():
@@ -52,19 +51,20 @@ def _save(figure, path: Path, **options) -> None:
     write_through(path, lambda file: figure.savefig(file, metadata=metadata, **options))
 
 
-def plot_curves(lit: Sequence[Lit], path: Path) -> None:
+def plot_curves(points: Sequence[curves.Point], path: Path) -> None:
     """Relative RMSE and FLIP against wall time under every light."""
     plt = pyplot()
-    columns = min(len(lit), 4)
+    lights = list(dict.fromkeys(point.light for point in points))
+    columns = min(len(lights), 4)
     legend = 0.25 * math.ceil((len(_STYLE) + 1) / columns)  # inches
     height = 6.0 + legend
     figure, axes = plt.subplots(
-        2, len(lit), figsize=(3.4 * len(lit), height), squeeze=False, sharex="col", sharey="row"
+        2, len(lights), figsize=(3.4 * len(lights), height), squeeze=False, sharex="col", sharey="row"
     )
-    for column, one in enumerate(lit):
+    for column, light in enumerate(lights):
         for axis, name, label in zip(axes[:, column], ("error", "flip"), ("relative RMSE", "FLIP"), strict=True):
             for method, (colour, marker) in _STYLE.items():
-                used = [p for p in one.points if p.method == method]
+                used = [p for p in points if (p.light, p.method) == (light, method)]
                 x, y = [p.seconds for p in used], [getattr(p, name) for p in used]
                 axis.plot(x, y, color=colour, marker=marker, markersize=5, linewidth=1.2, label=method)
             axis.set(xscale="log", yscale="log")
@@ -73,8 +73,8 @@ def plot_curves(lit: Sequence[Lit], path: Path) -> None:
             axis.yaxis.set_minor_formatter(plt.matplotlib.ticker.NullFormatter())
             if column == 0:
                 axis.set_ylabel(label)
-        _slope_triangle(axes[0, column], [p for p in one.points if p.method == curves.PATH])
-        axes[0, column].set_title(one.light)
+        _slope_triangle(axes[0, column], [p for p in points if (p.light, p.method) == (light, curves.PATH)])
+        axes[0, column].set_title(light)
         axes[1, column].set_xlabel("wall time, s")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
@@ -108,19 +108,20 @@ def plot_fits(points: Sequence[FitPoint], path: Path) -> None:
     plt.close(figure)
 
 
-def sheet(lit: Sequence[Lit], path: Path) -> None:
+def plot_sheet(lit: Sequence[Lit], path: Path) -> None:
     """A row for each light: reference and closed form in sRGB, regions, then what each cause adds, signed."""
     plt = pyplot()
     names = list(lit[0].pictures)
     titles = ["reference", "with visibility", "regions", *names[2:]]
-    ratio = lit[0].reference.mean.shape[0] / lit[0].reference.mean.shape[1]
+    height, width = lit[0].pictures["reference"].shape[:2]
     figure, axes = plt.subplots(
-        len(lit), len(titles), figsize=(1.75 * len(titles), 1.75 * ratio * len(lit) + 0.6), squeeze=False
+        len(lit), len(titles), figsize=(1.75 * len(titles), 1.75 * height / width * len(lit) + 0.6), squeeze=False
     )
     for row, one in zip(axes, lit, strict=True):
+        level = one.pictures["reference"][one.regions[HEAD]].mean()
         shown = [linear_to_srgb(np.clip(one.pictures[name], 0, 1)) for name in names[:2]]
         shown.append(_region_picture(one.regions))
-        shown += [one.pictures[name].mean(axis=-1) / (DIFFERENCE_RANGE * one.level) for name in names[2:]]
+        shown += [one.pictures[name].mean(axis=-1) / (DIFFERENCE_RANGE * level) for name in names[2:]]
         for axis, image in zip(row, shown, strict=True):
             if image.ndim == 3:
                 axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
@@ -128,9 +129,9 @@ def sheet(lit: Sequence[Lit], path: Path) -> None:
                 axis.imshow(image, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
             axis.set(xticks=[], yticks=[])
             axis.grid(False)
-        row[0].set_ylabel(one.light)
+        row[0].set_ylabel(one.figures["light"])
     for axis, title in zip(axes[0], titles, strict=True):
-        axis.set_title(_wrapped(title), fontsize=8)
+        axis.set_title(_wrap(title), fontsize=8)
     figure.tight_layout(pad=0.4)
     _save(figure, path, dpi=110)
     plt.close(figure)
@@ -143,7 +144,7 @@ def _region_picture(regions) -> np.ndarray:
     return picture
 
 
-def _wrapped(title: str) -> str:
+def _wrap(title: str) -> str:
     words, lines = title.split(), [""]
     for word in words:
         if len(lines[-1]) + len(word) > 18:

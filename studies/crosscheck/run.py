@@ -1,4 +1,4 @@
-"""All measurements of the cross-validation, one after the other, within a budget of time."""
+"""All measurements of the cross-check, one after the other, within a budget of time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import numpy as np
 
 from studies.crosscheck import causes, curves, speed
 from studies.crosscheck.case import Case
-from studies.crosscheck.evidence import Lit, kept, key_of
+from studies.crosscheck.evidence import Lit, key_of, load_or_measure
 from studies.crosscheck.images import LaunchLog, converge, path, render
-from studies.crosscheck.lights import OWN, SOFT, lobes_of
+from studies.crosscheck.lights import OWN, SETTINGS, SOFT, lobes_of
 from studies.crosscheck.regions import HEAD, SILHOUETTE
 
 # What each light may take of its share of the budget; loading, points and speed take the rest.
@@ -41,21 +41,9 @@ class Settings:
     speed: bool = True  # measure the ratios and costs too
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """Everything that the page tells."""
-
-    case: Case
-    settings: Settings
-    lit: list[Lit]
-    ratios: list[speed.Ratio]
-    costs: list[speed.Cost]
-    seconds: float  # wall time, of earlier runs too where their evidence was used
-
-
-def settings_of_light(case: Case, chosen: tuple[str, ...], names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Lobes [N_l, 7] by name: the `chosen` settings of `names`, or all of them and the scene's own."""
-    lights = {name: lobes_of(name) for name in chosen or names}
+def choose_lights(case: Case, chosen: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Lobes [N_l, 7] by name: the `chosen` settings, or all of them and the scene's own light."""
+    lights = {name: lobes_of(name) for name in chosen or SETTINGS}
     if case.lobes is not None and not chosen:
         lights = {OWN: case.lobes, **lights}
     return lights
@@ -67,14 +55,14 @@ def measure(
     settings: Settings,
     say: Callable[[str], object] = print,
     evidence: Path | None = None,
-) -> Measured:
-    """Measures everything; `say` is told what has been done. What the folder `evidence` holds of the same case and
-    settings is not measured again."""
+) -> tuple[dict, list[Lit]]:
+    """The figures as a JSON object, and what the sheet shows of each light. `say` is told about progress. What the
+    folder `evidence` holds of the same case and settings is not measured again; its time counts."""
     start, done = time.monotonic(), set()
     head = functools.cache(case.head)
 
     @functools.cache
-    def gathered():
+    def gather() -> tuple[mi.Shape, mi.Shape, list[causes.Half]]:
         heads = head(settings.voxel), head(settings.usual_voxel)
         halves = causes.gather(case, *heads, settings.side, settings.seed)
         say(f"heads and points after {time.monotonic() - start:.0f} s")
@@ -83,19 +71,19 @@ def measure(
     budget = 60 * settings.minutes * (0.85 if settings.speed else 1.0) / len(lights)
     lit = []
     for name, lobes in lights.items():
-        key = key_of(case, settings, lobes)
 
-        def compute(name=name, lobes=lobes):
+        def measure_light(name: str = name, lobes: np.ndarray = lobes) -> Lit:
             done.add(name)
-            return _under_light(case, *gathered(), name, lobes, settings, budget)
+            return _measure_light(case, *gather(), name, lobes, settings, budget)
 
-        lit.append(kept(evidence, name, key, compute))
-        one = lit[-1].reference
+        lit.append(load_or_measure(evidence, name, key_of(case, settings, lobes), measure_light))
+        reference = lit[-1].figures["reference"]
         say(
-            f"{name}: reference of {one.passes * settings.pass_samples} samples, standard error {100 * one.error:.2f}% "
-            f"after {one.seconds:.0f} s; all after {time.monotonic() - start:.0f} s"
+            f"{name}: reference of {reference['samples']} samples, standard error {100 * reference['error']:.2f}% "
+            f"after {reference['seconds']:.0f} s; all after {time.monotonic() - start:.0f} s"
         )
-    ratios, costs = [], []
+    ratios: list[speed.Ratio] = []
+    costs: list[speed.Cost] = []
     if settings.speed:
         lobes = lights.get(SOFT, next(iter(lights.values())))
         usual = head(settings.usual_voxel)
@@ -103,11 +91,18 @@ def measure(
         ratios.append(speed.compilation_ratio(case, usual, lobes))
         costs = [*speed.shading_costs(), *speed.width_costs(case, lobes)]
         say(f"speed after {time.monotonic() - start:.0f} s")
-    earlier = sum(one.seconds for one in lit if one.light not in done)
-    return Measured(case, settings, lit, ratios, costs, time.monotonic() - start + earlier)
+    earlier = sum(one.figures["seconds"] for one in lit if one.figures["light"] not in done)
+    figures = {
+        "case": {"name": case.name, "width": case.width, "height": case.height},
+        "settings": dataclasses.asdict(settings),
+        "seconds": time.monotonic() - start + earlier,
+        "lights": [one.figures for one in lit],
+        "speed": {"ratios": list(map(dataclasses.asdict, ratios)), "costs": list(map(dataclasses.asdict, costs))},
+    }
+    return figures, lit
 
 
-def _under_light(
+def _measure_light(
     case: Case,
     head: mi.Shape,
     usual: mi.Shape,
@@ -151,11 +146,24 @@ def _under_light(
     points, limits = curves.measure_curves(
         case, head, name, lobes, reference, mask, _CURVES * budget, settings.seed + _SEED_CURVES, log
     )
-    agreement = _agreement(scene, pictures, settings, mask & ~regions[SILHOUETTE], level)
-    seconds = time.monotonic() - start
-    return Lit(
-        name, reference, level, regions, rows, sheet, points, limits, agreement, seconds, *dataclasses.astuple(log)
-    )
+    figures = {
+        "light": name,
+        "reference": {
+            "samples": reference.passes * samples,
+            "error": reference.error,
+            "seconds": reference.seconds,
+            "converged": reference.converged,
+        },
+        "regions": {region: int(pixels.sum()) for region, pixels in regions.items()},
+        "agreement": _agreement(scene, pictures, settings, mask & ~regions[SILHOUETTE], level),
+        "launches": log.launches,
+        "non_finite": log.non_finite,
+        "causes": list(map(dataclasses.asdict, rows)),
+        "points": list(map(dataclasses.asdict, points)),
+        "limits": list(map(dataclasses.asdict, limits)),
+        "seconds": time.monotonic() - start,
+    }
+    return Lit(figures, sheet, regions)
 
 
 def _agreement(scene: mi.Scene, pictures: causes.Pictures, settings: Settings, mask: np.ndarray, level: float) -> float:
