@@ -24,9 +24,9 @@ def test_camera_projects_scales_and_crops(head):
     local = camera.world_to_camera @ np.append(head[5], 1)
     expected = np.array([900 * local[0] / local[2] + 320, 900 * local[1] / local[2] + 400])
     np.testing.assert_allclose(camera.project(head)[5], expected, rtol=1e-12)
-    np.testing.assert_allclose(camera.scaled(0.5, 0.25).project(head), camera.project(head) * [0.5, 0.25])
-    np.testing.assert_allclose(camera.cropped(30, 40, 100, 90).project(head), camera.project(head) - [30, 40])
-    assert camera.scaled(0.5, 0.25).width == 320 and camera.cropped(30, 40, 100, 90).height == 90
+    np.testing.assert_allclose(camera.scale(0.5, 0.25).project(head), camera.project(head) * [0.5, 0.25])
+    np.testing.assert_allclose(camera.crop(30, 40, 100, 90).project(head), camera.project(head) - [30, 40])
+    assert camera.scale(0.5, 0.25).width == 320 and camera.crop(30, 40, 100, 90).height == 90
     assert np.isnan(camera.project(camera.centre + camera.world_to_camera[2, :3] * -1)).all()
 
 

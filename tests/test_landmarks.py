@@ -17,11 +17,11 @@ from sira_mi.errors import InputError
 from sira_mi.portrait.face import Face
 from sira_mi.portrait.head_landmarks import (
     LandmarkCorrection,
-    aligned_face,
-    head_landmarks,
-    seen_from,
-    shipped_correction,
-    upright_axes,
+    align_face,
+    correct_landmarks,
+    find_upright_axes,
+    find_view_direction,
+    load_shipped_correction,
 )
 from sira_mi.training.landmark_regression import landmark_tensors
 from studies.portraits.measure_landmarks import Observation, fit_correction, measure_held_out_errors
@@ -62,16 +62,16 @@ def test_a_face_is_seen_from_where_it_was_turned(roll):
     """However the photo is rolled and whatever its size; the alignment takes the turn back."""
     for yaw, pitch in ((0.0, 0.0), (0.6, 0.0), (-0.4, 0.0), (0.0, 0.3)):
         face = turned(yaw, pitch, roll, size=90.0)
-        np.testing.assert_allclose(seen_from(face, MEAN), [-yaw, pitch], atol=1e-9)
-        back = aligned_face(face, MEAN)
+        np.testing.assert_allclose(find_view_direction(face, MEAN), [-yaw, pitch], atol=1e-9)
+        back = align_face(face, MEAN)
         np.testing.assert_allclose(back * face.size / 90, MEAN - MEAN.mean(axis=0), atol=1e-9)
 
 
 def test_the_correction_turns_and_grows_with_the_photo(face):
     """Of the photo turned by a quarter and enlarged, the corrected landmarks are the turned, enlarged ones."""
     moved = Face(face.landmarks @ np.array([[0, 3.0], [-3.0, 0]]) + [1600, 20], 3 * face.depth, face.presence)
-    expected = head_landmarks(face) @ np.array([[0, 3.0], [-3.0, 0]]) + [1600, 20]
-    np.testing.assert_allclose(head_landmarks(moved), expected, atol=0.02 * moved.size)
+    expected = correct_landmarks(face) @ np.array([[0, 3.0], [-3.0, 0]]) + [1600, 20]
+    np.testing.assert_allclose(correct_landmarks(moved), expected, atol=0.02 * moved.size)
 
 
 @pytest.mark.slow
@@ -80,13 +80,15 @@ def test_errors_that_follow_from_the_direction_are_learned():
     known = observations(200, seed=1)
     correction = fit_correction(known)
     for o in observations(20, seed=2):
-        left = np.nanmean(np.linalg.norm(head_landmarks(o.face, correction) - o.true, axis=1))
+        left = np.nanmean(np.linalg.norm(correct_landmarks(o.face, correction) - o.true, axis=1))
         assert left < 0.15 * np.nanmean(np.linalg.norm(o.face.landmarks - o.true, axis=1))
     found, corrected = measure_held_out_errors(known)
     assert corrected < 0.15 * found
     assert found == pytest.approx(np.mean([np.nanmean(np.linalg.norm(o.offset, axis=1)) for o in known]))
     near, far = (turned(yaw, 0, 0) for yaw in (0.8, 2.0))
-    near, far = ((head_landmarks(f, correction) - f.landmarks) @ upright_axes(f).T / f.size for f in (near, far))
+    near, far = (
+        (correct_landmarks(f, correction) - f.landmarks) @ find_upright_axes(f).T / f.size for f in (near, far)
+    )
     assert np.abs(far - near).mean() < 0.02 < 0.04 < np.abs(near).mean()
     with pytest.raises(InputError) as error:
         measure_held_out_errors(known[:8])
@@ -95,16 +97,16 @@ def test_errors_that_follow_from_the_direction_are_learned():
 
 def test_the_shipped_correction_moves_a_real_face_a_little(face):
     """By less than the network errs on rendered heads; its eyes, which the photo shows, stay."""
-    offset = np.linalg.norm(head_landmarks(face) - face.landmarks, axis=1) / face.size
+    offset = np.linalg.norm(correct_landmarks(face) - face.landmarks, axis=1) / face.size
     assert 0.002 < offset.mean() < 0.02 and offset.max() < 0.1
     assert offset[[33, 133, 362, 263]].max() < 0.008
 
 
 def test_a_damaged_correction_is_refused(tmp_path):
     path = tmp_path / "head_landmarks.safetensors"
-    shipped_correction().save(path)
+    load_shipped_correction().save(path)
     again = LandmarkCorrection.load(path)
-    np.testing.assert_allclose(again.offsets, shipped_correction().offsets)
+    np.testing.assert_allclose(again.offsets, load_shipped_correction().offsets)
     arrays = load_file(path)
     for name, values in (("mean", np.zeros((5, 3), np.float32)), ("offsets", arrays["offsets"] * np.float32(np.nan))):
         save_file(arrays | {name: values}, tmp_path / "bad.safetensors")

@@ -101,6 +101,7 @@ def test_greyscale_palette_cmyk_and_alpha(tmp_path, astronaut):
     cut.putalpha(Image.fromarray(np.tile(np.arange(160, dtype=np.uint8), (128, 1))))
     cut.save(tmp_path / "alpha.png")
     photo = load_photo(tmp_path / "alpha.png")
+    assert photo.alpha is not None
     np.testing.assert_allclose(photo.alpha[5], np.arange(160) / 255, atol=1e-6)
     np.testing.assert_allclose(photo.image, expected, atol=1e-6)
 

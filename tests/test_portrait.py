@@ -18,8 +18,8 @@ from sira_mi.portrait import (
     load_mask,
     load_photo,
     make_portrait,
-    person_mask,
     reprojection_error,
+    segment_person,
     select_face,
     srgb_to_linear,
 )
@@ -32,7 +32,7 @@ ORIENTATION = 0x0112
 
 @pytest.fixture(scope="module")
 def mask(astronaut, face):
-    return person_mask(astronaut, face)
+    return segment_person(astronaut, face)
 
 
 @pytest.fixture
@@ -119,7 +119,7 @@ def test_mask_agrees_with_a_composite(astronaut, mask):
     background = cv2.resize(skimage.data.coffee(), (360, 360), interpolation=cv2.INTER_AREA)
     linear = srgb_to_linear(astronaut[:360, 60:420] / 255.0) * alpha + srgb_to_linear(background / 255.0) * (1 - alpha)
     composite = (linear_to_srgb(linear) * 255 + 0.5).astype(np.uint8)
-    found = person_mask(composite, find_faces(composite)[0]) > 0.5
+    found = segment_person(composite, find_faces(composite)[0]) > 0.5
     figure = alpha[..., 0] > 0.5
     assert (found & figure).sum() / (found | figure).sum() > 0.95
 
@@ -128,7 +128,7 @@ def test_mask_keeps_only_the_chosen_person(astronaut):
     pair = np.concatenate([astronaut[:300, 80:380], astronaut[:300, 380:512], astronaut[:300, 80:380]], axis=1)
     faces = sorted(find_faces(pair), key=lambda f: f.box[0])
     for person, other in ((0, 1), (1, 0)):
-        result = person_mask(pair, faces[person])
+        result = segment_person(pair, faces[person])
         x, y = faces[person].landmarks.mean(axis=0).astype(int)
         assert result[y, x] == 1
         x, y = faces[other].landmarks.mean(axis=0).astype(int)
@@ -244,7 +244,7 @@ def test_given_camera_is_made_square_and_follows_the_image(tmp_path, photo_file,
     camera = estimate_camera(face.landmarks, head, 512, 512)
     stretched = cv2.resize(astronaut, (1024, 768), interpolation=cv2.INTER_CUBIC)
     Image.fromarray(stretched).save(tmp_path / "stretched.png", compress_level=1)
-    (tmp_path / "camera.json").write_text(camera.scaled(2.0, 1.5).to_json())
+    (tmp_path / "camera.json").write_text(camera.scale(2.0, 1.5).to_json())
     portrait = make_portrait(
         tmp_path / "stretched.png", PortraitSettings(working_size=400), head, camera_path=tmp_path / "camera.json"
     )

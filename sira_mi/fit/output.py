@@ -73,7 +73,7 @@ def box_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
     """The camera of a tile of the contact sheet: of the part `box` (x0, y0, x1, y1) of the photo's frame."""
     x0, y0, x1, y1 = box
     scale = _TILE / max(x1 - x0, y1 - y0)
-    return camera.cropped(x0, y0, x1 - x0, y1 - y0).scaled(scale, scale)
+    return camera.crop(x0, y0, x1 - x0, y1 - y0).scale(scale, scale)
 
 
 def _tile(image: np.ndarray) -> np.ndarray:

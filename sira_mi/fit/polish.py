@@ -151,8 +151,8 @@ def polish_scene(portrait: Portrait, avatar_path: str | Path, settings: FitSetti
     x0, y0, x1, y1 = head_box(portrait.mask)
     factor = min(1.0, settings.polish.size / max(x1 - x0, y1 - y0))
     width, height = round((x1 - x0) * factor), round((y1 - y0) * factor)
-    camera = portrait.camera.cropped(x0, y0, x1 - x0, y1 - y0)
-    camera = camera.scaled(width / camera.width, height / camera.height, width, height)
+    camera = portrait.camera.crop(x0, y0, x1 - x0, y1 - y0)
+    camera = camera.scale(width / camera.width, height / camera.height, width, height)
     avatar, description = load_avatar(avatar_path), head(avatar_path, settings.final_voxel, baked=True)
     description["bsdf"]["roughness"] = avatar.roughness
     integrator = {"type": "prb", "max_depth": settings.polish.depth, "hide_emitters": True}

@@ -3,7 +3,7 @@
 from sira_mi.portrait.camera import Camera, estimate_camera, reprojection_error
 from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.load import Photo, linear_to_srgb, load_photo, srgb_to_linear
-from sira_mi.portrait.mask import load_mask, person_mask
+from sira_mi.portrait.mask import load_mask, segment_person
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 
 __all__ = [
@@ -18,8 +18,8 @@ __all__ = [
     "load_mask",
     "load_photo",
     "make_portrait",
-    "person_mask",
     "reprojection_error",
+    "segment_person",
     "select_face",
     "srgb_to_linear",
 ]

@@ -18,8 +18,8 @@ _FILM_DIAGONAL = 43.2666  # mm, of the 36 mm x 24 mm frame that EXIF's 35 mm foc
 _MEDIAN_DISTANCE = 1200.0 / MILLIMETRES_PER_UNIT
 _SPREAD_DISTANCE = 0.5  # standard deviation of the logarithm
 
-# A mean head is not this person's: its landmarks lie a hundredth or two of the face's height off, and neighbours err
-# alike, so that all landmarks together count as this many independent ones.
+# The landmarks of the mean head differ from this person's by one or two hundredths of the face's height. Neighbours
+# have similar errors, so all landmarks together count as this many independent ones.
 _LANDMARK_ERROR = 0.015  # of the face's height
 _INDEPENDENT_LANDMARKS = 30.0
 
@@ -43,10 +43,10 @@ class Camera:
 
     @property
     def centre(self) -> np.ndarray:
-        """Where the camera stands, `[3]` in world units."""
+        """Position of the camera, `[3]` in world units."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
-    def scaled(self, sx: float, sy: float, width: int | None = None, height: int | None = None) -> "Camera":
+    def scale(self, sx: float, sy: float, width: int | None = None, height: int | None = None) -> "Camera":
         """The camera of the image resampled by `sx` and `sy`; its size is rounded unless it is given."""
         return Camera(
             np.diag([sx, sy, 1.0]) @ self.K,
@@ -55,7 +55,7 @@ class Camera:
             max(1, round(self.height * sy)) if height is None else height,
         )
 
-    def cropped(self, x0: float, y0: float, width: int, height: int) -> "Camera":
+    def crop(self, x0: float, y0: float, width: int, height: int) -> "Camera":
         """The camera of the window that starts at pixel position (x0, y0)."""
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
         return Camera(shift @ self.K, self.world_to_camera, width, height)
@@ -119,9 +119,9 @@ def focal_from_exif(focal_35mm: float, width: int, height: int) -> float:
 
 
 def landmark_weights(count: int) -> np.ndarray:
-    """How much to trust each landmark for the pose, `[count]`: rigid parts most, what expressions move least.
+    """Weights `[count]` of the landmarks for the pose: high on rigid parts, low where expressions move the face.
 
-    Any other number of landmarks than `LANDMARKS` is weighted evenly."""
+    A number of landmarks other than `LANDMARKS` is weighted evenly."""
     weights = np.ones(count)
     if count == LANDMARKS:
         weights[:] = 0.3

@@ -23,7 +23,7 @@ _MODELS = Path(__file__).parent / "models"
 _DETECTOR_SIDE, _LANDMARK_SIDE = 128, 192
 _DETECTOR_SCORE = 0.5
 _PRESENCE = 0.5
-_SURE = 0.95  # a face of less presence may be upside down; if it is, the turned crop shows a surer one
+_SURE = 0.95  # a face of less presence may be upside down: the turned crop is tried, and taken above this
 _SEARCH_SIDE = 2048  # pixels; longest side of the image that the detector searches
 _LANDMARK_MARGIN = 1.5  # side of the landmark crop over the size of the face
 _MARGIN_TURN = ((1.5, 0.0), (1.4, -6.0), (1.6, 6.0), (1.4, 6.0), (1.6, -6.0))  # last pass: crop margin, degrees
@@ -62,7 +62,7 @@ def load_network(name: str) -> cv2.dnn.Net:
 
 
 def find_faces(image: np.ndarray) -> list[Face]:
-    """All faces that detector and landmark network agree on, the largest first."""
+    """All faces that both the detector and the landmark network accept, the largest first."""
     scale = min(1.0, _SEARCH_SIDE / max(image.shape[:2]))
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -70,7 +70,7 @@ def find_faces(image: np.ndarray) -> list[Face]:
     for windows in _search_windows(small.shape[1], small.shape[0]):
         candidates = [c for window in windows for c in _detect(small, *window)]
         candidates.sort(key=lambda c: -c[0])
-        for _, keypoints, box_size in _without_repeats(candidates):
+        for _, keypoints, box_size in _drop_repeats(candidates):
             face = _fit_landmarks(image, keypoints / scale, box_size / scale)
             is_face = face.presence >= _PRESENCE and face.size >= _SMALLEST_FACE
             if is_face and not any(_same_face(face, other) for other in faces):
@@ -99,8 +99,8 @@ def select_face(faces: list[Face], index: int | None) -> tuple[Face, tuple[str, 
     return face, tuple(notes)
 
 
-def landmarks_of(image: np.ndarray, face: Face) -> Face:
-    """Landmarks measured again around a known face."""
+def refine_landmarks(image: np.ndarray, face: Face) -> Face:
+    """Landmarks of a known face, found again in crops around it."""
     corners = face.landmarks[list(EYE_CORNERS)]
     return _refine(image, face.landmarks.min(axis=0), face.landmarks.max(axis=0), corners)
 
@@ -176,7 +176,7 @@ def _detect(image: np.ndarray, left: float, top: float, side: float) -> list[tup
     return found
 
 
-def _without_repeats(candidates: list[tuple[float, np.ndarray, float]]) -> list[tuple[float, np.ndarray, float]]:
+def _drop_repeats(candidates: list[tuple[float, np.ndarray, float]]) -> list[tuple[float, np.ndarray, float]]:
     """Drops detections whose centre lies within half a face of a better one of similar size."""
     kept: list[tuple[float, np.ndarray, float]] = []
     for candidate in candidates:
@@ -196,19 +196,19 @@ def _same_face(face: Face, other: Face) -> bool:
 
 def _fit_landmarks(image: np.ndarray, keypoints: np.ndarray, box_size: float) -> Face:
     """Landmarks from a detection (eyes and box centre `[3, 2]`, box side). The detector takes a face that is upside
-    down for an upright one, so that a doubtful one is tried the other way up too."""
+    down for an upright one, so a doubtful face is tried the other way up as well."""
     lower, upper = keypoints[2] - box_size / 2, keypoints[2] + box_size / 2
-    face = _settled(image, lower, upper, keypoints[:2])
+    face = _settle(image, lower, upper, keypoints[:2])
     if face.presence < _SURE:
-        turned = _settled(image, lower, upper, keypoints[1::-1])
+        turned = _settle(image, lower, upper, keypoints[1::-1])
         face = turned if turned.presence >= _SURE else face
     return face
 
 
-def _settled(image: np.ndarray, lower: np.ndarray, upper: np.ndarray, eyes: np.ndarray) -> Face:
-    """Landmarks cropped anew around each result, as far as there may be a face at all."""
+def _settle(image: np.ndarray, lower: np.ndarray, upper: np.ndarray, eyes: np.ndarray) -> Face:
+    """Landmarks found three times, each in crops around the last result; once where there is hardly a face."""
     face = _refine(image, lower, upper, eyes, passes=1)
-    return landmarks_of(image, landmarks_of(image, face)) if face.presence >= _PRESENCE / 4 else face
+    return refine_landmarks(image, refine_landmarks(image, face)) if face.presence >= _PRESENCE / 4 else face
 
 
 def _refine(

@@ -1,11 +1,10 @@
-"""Where the landmarks of the head lie in the photo, hidden ones too: a correction of what the landmark network finds.
+"""Corrects the landmarks of the network to the positions of the head's landmarks in the photo, hidden ones included.
 
-The network draws the far side of a turned face too near, and calls other points of a head its landmarks than those that
-the prior's heads carry. That error goes with the direction from which the face is seen, and the correction is a
-polynomial of it. The coefficients come from portraits of heads whose landmarks are known
-(`python -m studies.portraits landmarks`). Coordinates of the face's shape would tell a little more of the error on such
-heads (`docs/notebook/portraits.md`), but rendered heads do not smile, and the correction of a smile was wrong.
-"""
+The network places the far side of a turned face too near, and its landmarks are not exactly the points that the prior's
+heads use. This error depends on the viewing direction, so the correction is a polynomial of that direction. The
+coefficients come from portraits of heads with known landmarks (`python -m studies.portraits landmarks`). Coordinates of
+the face's shape explain a little more of the error on those heads (`docs/notebook/portraits.md`), but rendered heads do
+not smile, and the correction of a smile was wrong."""
 
 from __future__ import annotations
 
@@ -29,11 +28,11 @@ TERMS = 7  # of the polynomial
 
 @dataclass(frozen=True, eq=False)
 class LandmarkCorrection:
-    """The offset of a face's landmarks by where it is seen from."""
+    """The offset of a face's landmarks by viewing direction."""
 
     mean: np.ndarray  # [468, 3] the network's mean face, seen from the front
-    reach: np.ndarray  # [2] largest yaw and pitch that were measured, radians: beyond them the offset stays
-    offsets: np.ndarray  # [7, 468, 2] by `polynomial`, in face sizes, along the axes of the upright face
+    reach: np.ndarray  # [2] largest measured yaw and pitch, radians; beyond them the offset is constant
+    offsets: np.ndarray  # [7, 468, 2] by `evaluate_polynomial`, in face sizes, along the axes of the upright face
 
     def save(self, path: Path) -> None:
         """Raises InputError when the file cannot be written."""
@@ -55,48 +54,50 @@ class LandmarkCorrection:
 
 
 @lru_cache(maxsize=1)
-def shipped_correction() -> LandmarkCorrection:
+def load_shipped_correction() -> LandmarkCorrection:
+    """Raises InputError when the package's file is missing or damaged."""
     return LandmarkCorrection.load(CORRECTION)
 
 
-def head_landmarks(face: Face, correction: LandmarkCorrection | None = None) -> np.ndarray:
-    """Where the head's landmarks lie [468, 2], in the pixels of `face`; by the shipped correction unless another is
+def correct_landmarks(face: Face, correction: LandmarkCorrection | None = None) -> np.ndarray:
+    """Positions of the head's landmarks [468, 2], in the pixels of `face`; by the shipped correction unless another is
     given."""
-    correction = correction or shipped_correction()
-    terms = polynomial(np.clip(seen_from(face, correction.mean), -correction.reach, correction.reach))
+    correction = correction or load_shipped_correction()
+    terms = evaluate_polynomial(
+        np.clip(find_view_direction(face, correction.mean), -correction.reach, correction.reach)
+    )
     offset = np.tensordot(terms, correction.offsets, axes=1)
-    return face.landmarks + face.size * offset @ upright_axes(face)
+    return face.landmarks + face.size * offset @ find_upright_axes(face)
 
 
-def polynomial(direction: np.ndarray) -> np.ndarray:
-    """The terms [..., 7] of yaw and pitch [..., 2]: of second order, and yaw |yaw| for what a face hides of its far
-    side."""
+def evaluate_polynomial(direction: np.ndarray) -> np.ndarray:
+    """The terms [..., 7] of yaw and pitch [..., 2]: second order, and yaw |yaw| for the hidden far side of a face."""
     yaw, pitch = direction[..., 0], direction[..., 1]
     return np.stack([np.ones_like(yaw), yaw, pitch, yaw**2, yaw * pitch, pitch**2, yaw * np.abs(yaw)], axis=-1)
 
 
-def seen_from(face: Face, mean: np.ndarray) -> np.ndarray:
-    """Yaw and pitch [2] of the viewing direction in the frame of the `mean` face [468, 3], radians, by the rigid parts
-    of the face; a roll of the photo does not change them."""
+def find_view_direction(face: Face, mean: np.ndarray) -> np.ndarray:
+    """Yaw and pitch [2] of the viewing direction in the frame of the `mean` face [468, 3], radians, from the rigid
+    parts of the face. They do not depend on the roll of the photo."""
     x, y, z = _rotation(face, mean)[:, 2]
     return np.array([np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))])
 
 
-def aligned_face(face: Face, mean: np.ndarray) -> np.ndarray:
-    """The network's landmarks with their depth [468, 3], in face sizes about their centre, turned as the `mean` face
+def align_face(face: Face, mean: np.ndarray) -> np.ndarray:
+    """The network's landmarks with their depth [468, 3], in face sizes about their centre, turned to the `mean` face
     [468, 3]."""
     points = np.column_stack([face.landmarks, face.depth]) / face.size
     return (points - points.mean(axis=0)) @ _rotation(face, mean).T
 
 
-def upright_axes(face: Face) -> np.ndarray:
+def find_upright_axes(face: Face) -> np.ndarray:
     """The directions in the photo [2, 2] of the upright face's x axis, along its eyes, and y axis, as rows."""
     cosine, sine = np.cos(np.radians(face.roll)), np.sin(np.radians(face.roll))
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
 def _rotation(face: Face, mean: np.ndarray) -> np.ndarray:
-    """[3, 3] from the photo's axes to those of the mean face: of least squares, over the rigid parts."""
+    """[3, 3] from the photo's axes to those of the mean face: least squares over the rigid parts."""
     rigid = list(RIGID)
     points = np.column_stack([face.landmarks, face.depth])[rigid]
     target = mean[rigid]

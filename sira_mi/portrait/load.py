@@ -1,4 +1,4 @@
-"""Photo files to linear Rec.709 images: colour, orientation, alpha, size limits and what EXIF says of the lens."""
+"""Photo files to linear Rec.709 images: colour, orientation, alpha, size limits and EXIF data of the lens."""
 
 import contextlib
 import io
@@ -64,10 +64,10 @@ def orient(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def load_photo(path: str | Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
-    """Reads a photo: JPEG, PNG, TIFF and what else Pillow reads, with 8 or 16 bits, or a linear EXR, taken as it is.
+    """Reads a photo: a format that Pillow reads (JPEG, PNG, TIFF, ...) with 8 or 16 bits, or a linear EXR.
 
     A photo of more than `max_pixels` is reduced by a power of two, averaging in linear light.
-    Raises `InputError` for whatever is not such a file.
+    Raises `InputError` for any other file.
     """
     path = Path(path)
     _check_file(path, "photo")
@@ -80,7 +80,7 @@ def load_photo(path: str | Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
 
 
 def load_grey(path: str | Path, max_pixels: int) -> tuple[np.ndarray, tuple[int, int], int]:
-    """Reads a mask image by its stored values (no transfer function; alpha where colour says nothing).
+    """Reads a mask image by its stored values (no transfer function; its alpha where the colour is constant).
 
     Returns the mask `[H, W]` float32 in [0, 1] after the file's own EXIF orientation and reduction, the full size
     (width, height) after orientation, and the reduction. Raises `InputError` as `load_photo` does.
@@ -141,9 +141,8 @@ def _reduction(width: int, height: int, max_pixels: int) -> int:
 
 @contextlib.contextmanager
 def _quiet_decoders() -> Iterator[None]:
-    """Keeps the decoders' own messages off the terminal, which speak past `InputError`: Python's warnings, what OpenEXR
-    prints, and what libtiff and OpenEXR write from C to file descriptor 2. Lifts Pillow's size limit meanwhile, whose
-    place `_check_size` takes."""
+    """Silences the decoders: Python's warnings, the prints of OpenEXR, and what libtiff and OpenEXR write from C to
+    file descriptor 2. Also lifts Pillow's size limit, which `_check_size` replaces."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
@@ -200,7 +199,8 @@ def _decode(path: Path, picture: Image.Image, max_pixels: int, decode: Callable)
 def _reduce(
     size: tuple[int, int], orientation: int, max_pixels: int, strip: Callable, decode: Callable
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Decodes strip by strip, averages blocks and orients; what the blocks cut off lies right and below afterwards."""
+    """Decodes strip by strip, averages blocks and orients. Rows and columns that fill no block are cut right and
+    below."""
     factor = _reduction(*size, max_pixels)
     width, height = size[0] // factor, size[1] // factor
     left = size[0] % factor if orientation in _FLIPS_X else 0

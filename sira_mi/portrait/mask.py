@@ -1,4 +1,4 @@
-"""Foreground masks: person segmentation around the head, refined to the image's own edges; or what the user gives.
+"""Foreground masks: person segmentation around the head, refined to the image's own edges, or a given mask file.
 
 The network (`models/selfie_segmentation.tflite`) answers at 256x256, so its answers for nested square windows from
 the head outwards are averaged. GrabCut (Rother, Kolmogorov and Blake 2004) then moves the outline to the image's
@@ -27,9 +27,9 @@ _EDGE_EPSILON = 4e-4  # variance of sRGB values in [0, 1] that counts as texture
 _CONTRAST = (0.1, 0.9)  # filtered values below and above these become 0 and 1
 
 
-def person_mask(image: np.ndarray, face: Face) -> np.ndarray:
+def segment_person(image: np.ndarray, face: Face) -> np.ndarray:
     """The person whose face this is, hair and clothes included, with soft edges."""
-    probability = person_probability(image, face)
+    probability = estimate_probability(image, face)
     outline = _cut_outline(image, clean_mask(probability, face), _BAND * face.size)
     radius = max(2, round(0.02 * face.size))
     refined = guided_filter(image.astype(np.float32) / 255, clean_mask(outline, face), radius, _EDGE_EPSILON)
@@ -37,7 +37,7 @@ def person_mask(image: np.ndarray, face: Face) -> np.ndarray:
     return clean_mask(np.clip((refined - low) / (high - low), 0, 1), face)
 
 
-def person_probability(image: np.ndarray, face: Face) -> np.ndarray:
+def estimate_probability(image: np.ndarray, face: Face) -> np.ndarray:
     """Foreground probability `[H, W]`: the average over nested windows around the face and over mirror images, the
     closer windows weighing more."""
     height, width = image.shape[:2]
@@ -74,7 +74,7 @@ def clean_mask(mask: np.ndarray, face: Face | None) -> np.ndarray:
     kept = labels == areas.argmax()
     filled = _fill_holes(kept)
     others = (solid > 0) & ~filled
-    around_others = _grown(others) & ~_grown(filled)
+    around_others = _dilate(others) & ~_dilate(filled)
     result = np.where(others | around_others, 0, mask)
     return np.where(filled & ~kept, 1, result).astype(np.float32)
 
@@ -180,6 +180,6 @@ def _fill_holes(solid: np.ndarray) -> np.ndarray:
     return labels[1:-1, 1:-1] != labels[0, 0]
 
 
-def _grown(region: np.ndarray) -> np.ndarray:
+def _dilate(region: np.ndarray) -> np.ndarray:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
     return cv2.dilate(region.astype(np.uint8), disc) > 0

@@ -1,4 +1,4 @@
-"""One portrait photo to what a fit starts from: linear image, foreground mask, landmarks and camera."""
+"""From one portrait photo to the input of a fit: linear image, foreground mask, landmarks and camera."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +10,9 @@ from sira_mi.conventions import LANDMARKS, LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera, estimate_camera, reprojection_error
 from sira_mi.portrait.face import Face, find_faces, select_face
-from sira_mi.portrait.head_landmarks import head_landmarks
+from sira_mi.portrait.head_landmarks import correct_landmarks
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
-from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, person_mask
+from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, segment_person
 
 _MIN_FACE_SHARE = 0.2  # of the working size; below it the photo is cropped to the head first
 _WINDOW = 4.5  # side of that crop, in face sizes
@@ -31,10 +31,10 @@ class PortraitSettings:
 class Portrait:
     image: np.ndarray  # [H, W, 3] float32, linear Rec.709
     mask: np.ndarray  # [H, W] float32 in [0, 1], 1 is the person
-    landmarks: np.ndarray  # [468, 2] float64, pixels of `image`, where the photo shows them; NaN without a face
-    head_landmarks: np.ndarray  # [468, 2] likewise, where those of the head are, hidden ones too
+    landmarks: np.ndarray  # [468, 2] float64, pixels of `image`, as the network finds them; NaN without a face
+    head_landmarks: np.ndarray  # [468, 2] likewise, corrected to those of the head, hidden ones included
     camera: Camera  # of `image`, with square pixels
-    notes: tuple[str, ...]  # what the user should know, one line each
+    notes: tuple[str, ...]  # messages for the user, one line each
 
 
 @dataclass(frozen=True)
@@ -63,18 +63,18 @@ def make_portrait(
     camera_path: str | Path | None = None,
     face: int | None = None,
 ) -> Portrait:
-    """Loads a photo and finds or reads all that the fit needs of it.
+    """Loads a photo; finds its face, mask and camera, or reads the latter two from files.
 
     `mean_landmarks` `[468, 3]` are the mean head's, in world units, NaN where unknown. `face` counts from 0 by size,
-    largest first. With both `mask_path` and `camera_path` a photo without a face will do.
-    Raises `InputError` for whatever the user can mend.
+    largest first. With both `mask_path` and `camera_path` the photo need not show a face.
+    Raises `InputError` for bad files and photos.
     """
     photo = load_photo(path, settings.max_pixels)
     notes = list(photo.notes)
     given_camera = None if camera_path is None else _read_camera(camera_path, photo)
     given_mask = None if mask_path is None else load_mask(mask_path, photo, settings.max_pixels)
 
-    shown = display_image(photo.image)
+    shown = make_display_image(photo.image)
     faces = find_faces(shown)
     found = None
     if faces or face is not None or given_camera is None or given_mask is None:
@@ -83,19 +83,19 @@ def make_portrait(
     else:
         notes.append("no face found: using the given camera and mask alone")
 
-    in_photo = None if found is None else head_landmarks(found)
+    in_photo = None if found is None else correct_landmarks(found)
     camera = given_camera
     if camera is None:
-        assert found is not None  # select_face raises otherwise
+        assert found is not None and in_photo is not None  # select_face raises otherwise
         camera = _fit_camera(photo, in_photo, found.size, mean_landmarks, notes)
     window = _choose_window(photo, found, camera, settings.working_size, notes)
     image = np.maximum(window.resample(photo.image), 0)
     height, width = image.shape[:2]
-    camera = camera.cropped(window.x0, window.y0, 0, 0).scaled(window.scale_x, window.scale_y, width, height)
+    camera = camera.crop(window.x0, window.y0, 0, 0).scale(window.scale_x, window.scale_y, width, height)
 
     landmarks = of_head = np.full((LANDMARKS, 2), np.nan)
     working_face = None
-    if found is not None:
+    if found is not None and in_photo is not None:
         landmarks, of_head = window.to_working(found.landmarks), window.to_working(in_photo)
         working_face = Face(landmarks, found.depth * window.scale_x, found.presence)
     mask = _make_mask(photo, given_mask, window, image, working_face, notes)
@@ -106,8 +106,8 @@ def make_portrait(
     return Portrait(image.astype(np.float32), mask.astype(np.float32), landmarks, of_head, camera, tuple(notes))
 
 
-def display_image(image: np.ndarray) -> np.ndarray:
-    """A linear image `[H, W, 3]` as sRGB uint8 for the networks; exposed anew where it is far too dark or bright."""
+def make_display_image(image: np.ndarray) -> np.ndarray:
+    """A linear image `[H, W, 3]` as sRGB uint8 for the networks; a far too dark or bright one is exposed anew."""
     bright = float(np.percentile(image[::4, ::4] @ np.array(LUMINANCE, np.float32), 99))
     exposure = 0.8 / bright if bright > 0 and not 0.1 <= bright <= 1.0 else 1.0
     return np.concatenate(
@@ -116,7 +116,7 @@ def display_image(image: np.ndarray) -> np.ndarray:
 
 
 def halve(portrait: Portrait) -> Portrait:
-    """The portrait at half its size; a pixel is the person's where all of it is."""
+    """The portrait at half its size. The mask keeps the pixels that the person covers fully."""
     width, height = (max(1, size // 2) for size in (portrait.camera.width, portrait.camera.height))
     scale = width / portrait.camera.width, height / portrait.camera.height
     image, mask = (area_resample(a, (0, 0), scale, (width, height)) for a in (portrait.image, portrait.mask))
@@ -126,7 +126,7 @@ def halve(portrait: Portrait) -> Portrait:
         mask=(mask > 0.99).astype(np.float32),
         landmarks=portrait.landmarks * scale,
         head_landmarks=portrait.head_landmarks * scale,
-        camera=portrait.camera.scaled(*scale, width, height),
+        camera=portrait.camera.scale(*scale, width, height),
     )
 
 
@@ -167,7 +167,7 @@ def _read_camera(path: str | Path, photo: Photo) -> Camera:
         raise InputError(f"{path} is not a camera file: it should be JSON text") from None
     camera = Camera.from_json(text, str(path), photo.full_size)
     height, width = photo.image.shape[:2]
-    return camera.scaled(1 / photo.reduction, 1 / photo.reduction, width, height)
+    return camera.scale(1 / photo.reduction, 1 / photo.reduction, width, height)
 
 
 def _fit_camera(
@@ -223,7 +223,7 @@ def _make_mask(
         if abs(face.roll) > _LARGEST_ROLL:
             how = "upside down" if abs(face.roll) > 135 else "on its side"
             raise InputError(f"the face is {how}: turn the photo upright, or give --mask")
-        mask = person_mask(display_image(image), face)
+        mask = segment_person(make_display_image(image), face)
     if not (mask > 0.5).any():
         raise InputError("the mask is empty where the face is: give another with --mask, or select --face N")
     return mask

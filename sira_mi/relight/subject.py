@@ -39,7 +39,7 @@ class Subject:
         width, height = (max(1, round(side * size / longer)) for side in (self.camera.width, self.camera.height))
         return replace(
             self,
-            camera=self.camera.scaled(width / self.camera.width, height / self.camera.height, width, height),
+            camera=self.camera.scale(width / self.camera.width, height / self.camera.height, width, height),
         )
 
 

@@ -57,7 +57,7 @@ def load_case(path: Path | None, size: int) -> Case:
     Raises InputError for anything else."""
     if path is None:
         avatar, camera = load_avatar(), PORTRAIT_CAMERA
-        camera = camera.scaled(size / camera.width, size / camera.height, size, size)
+        camera = camera.scale(size / camera.width, size / camera.height, size, size)
         name, file = "the mean head of the shipped prior", ""
     elif path.suffix.lower() == ".xml":
         return _case_of_scene(path, size)

@@ -62,7 +62,7 @@ def _photo_camera(photo: Path, camera: Camera) -> Camera:
     width, height = Image.open(photo).size
     if camera.width * height != camera.height * width:
         raise InputError(f"{photo} is cropped to its face before a fit; the benchmark needs photos that are not")
-    return camera.scaled(width / camera.width, height / camera.height, width, height)
+    return camera.scale(width / camera.width, height / camera.height, width, height)
 
 
 def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settings: FitSettings) -> None:

@@ -12,14 +12,14 @@ from sira_mi.portrait.face import Face, find_faces
 from sira_mi.portrait.head_landmarks import (
     TERMS,
     LandmarkCorrection,
-    aligned_face,
-    head_landmarks,
-    polynomial,
-    seen_from,
-    upright_axes,
+    align_face,
+    correct_landmarks,
+    evaluate_polynomial,
+    find_upright_axes,
+    find_view_direction,
 )
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, load_photo
-from sira_mi.portrait.portrait import display_image
+from sira_mi.portrait.portrait import make_display_image
 from studies.portraits.benchmark import read_benchmark
 from studies.portraits.truth import load_truth
 
@@ -40,7 +40,7 @@ class Observation:
     @property
     def offset(self) -> np.ndarray:
         """From found to true [468, 2], in face sizes along the axes of the upright face."""
-        return (self.true - self.face.landmarks) @ upright_axes(self.face).T / self.face.size
+        return (self.true - self.face.landmarks) @ find_upright_axes(self.face).T / self.face.size
 
 
 def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
@@ -53,7 +53,7 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
         known = np.isfinite(truth.landmarks).all(axis=1)
         true = np.full((len(truth.landmarks), 2), np.nan)
         true[known] = truth.camera.project(truth.landmarks[known])
-        faces = find_faces(display_image(load_photo(folder / "photo.jpg", DEFAULT_MAX_PIXELS).image))
+        faces = find_faces(make_display_image(load_photo(folder / "photo.jpg", DEFAULT_MAX_PIXELS).image))
         observations = [Observation(entry["identity"], face, true) for face in faces]
         near = [o for o in observations if np.nanmean(np.abs(o.offset)) < _ELSEWHERE]
         if near:
@@ -67,12 +67,12 @@ def fit_correction(observations: list[Observation]) -> LandmarkCorrection:
     """Least-squares fit of the offsets by the polynomial of the viewing direction. Unknown landmarks of a head count as
     the mean of the other heads'."""
     mean = _mean_face(observations)
-    directions = np.stack([seen_from(o.face, mean) for o in observations])
+    directions = np.stack([find_view_direction(o.face, mean) for o in observations])
     offsets = np.stack([o.offset for o in observations])
     with np.errstate(invalid="ignore"):
         usual = np.nanmean(offsets, axis=0)
     offsets = np.nan_to_num(np.where(np.isfinite(offsets), offsets, usual)).reshape(len(observations), -1)
-    coefficients = np.linalg.lstsq(polynomial(directions), offsets, rcond=None)[0]
+    coefficients = np.linalg.lstsq(evaluate_polynomial(directions), offsets, rcond=None)[0]
     return LandmarkCorrection(mean, np.abs(directions).max(axis=0), coefficients.reshape(TERMS, -1, 2))
 
 
@@ -83,7 +83,7 @@ def _mean_face(observations: list[Observation]) -> np.ndarray:
     first = observations[int(np.argmin(skew))].face
     mean = np.column_stack([first.landmarks, first.depth]) / first.size
     for _ in range(_ALIGNMENTS):
-        mean = np.mean([aligned_face(o.face, mean) for o in observations], axis=0)
+        mean = np.mean([align_face(o.face, mean) for o in observations], axis=0)
     return mean
 
 
@@ -100,7 +100,7 @@ def measure_held_out_errors(observations: list[Observation]) -> tuple[float, flo
         for o in observations:
             if fold[o.head] == k:
                 found.append(_distance(o, o.face.landmarks))
-                corrected.append(_distance(o, head_landmarks(o.face, correction)))
+                corrected.append(_distance(o, correct_landmarks(o.face, correction)))
     return float(np.mean(found)), float(np.mean(corrected))
 
 

@@ -135,7 +135,7 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
     scale = camera.width / width, camera.height / height
     inside = truth.mask[::-1, ::-1] if given.turned else truth.mask
     inside = area_resample(inside, (0, 0), scale, (camera.width, camera.height)) * (layers["mask"] > 0.99)
-    camera = camera.scaled(1 / scale[0], 1 / scale[1], width, height)
+    camera = camera.scale(1 / scale[0], 1 / scale[1], width, height)
     if given.turned:
         camera = Camera(camera.K, np.diag([-1.0, -1.0, 1.0, 1.0]) @ camera.world_to_camera, width, height)
     sampling = GeometrySettings(samples=_GEOMETRY_SAMPLES, icp_points=2000)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
-from sira_mi.portrait.face import Face, find_faces, landmarks_of
+from sira_mi.portrait.face import Face, find_faces, refine_landmarks
 from sira_mi.training.collection.landmarks import mesh_landmarks
 from sira_mi.training.collection.makehuman import ANCESTRIES, Identity, identity_vertices
 from sira_mi.training.collection.person import make_person
@@ -241,7 +241,7 @@ def _face(image, intrinsic, pose, settings):
     expected[~valid] = expected[valid].mean(0)
     face = Face(expected, np.zeros(LANDMARKS), 1.0)
     for _ in range(2):
-        face = landmarks_of(image, face)
+        face = refine_landmarks(image, face)
     return face if face.presence >= settings.presence else None
 
 
