@@ -1,4 +1,5 @@
 from collections.abc import Mapping
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +24,8 @@ def find_avatar(props, name: str = "avatar") -> str:
     """The path in a plugin's property `name`: relative to the scene file's folder if it is found there, else to the
     current one; empty where none is given."""
     path = props.get(name, "")
-    return str(mi.file_resolver().resolve(path)) if path else ""
+    resolver: Any = mi.file_resolver  # a function, which the stubs call an object
+    return str(resolver().resolve(path)) if path else ""
 
 
 class NeuralAlbedo(mi.Texture):

@@ -1,3 +1,5 @@
+from typing import Any, cast
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -5,7 +7,7 @@ import numpy as np
 from sira_mi.avatar.file import load_avatar
 from sira_mi.avatar.shape import POSE, SHAPE_PARAMETERS, HeadShape
 from sira_mi.fields import tracing
-from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, scatter_columns, to_columns
+from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, gather_columns, scatter_columns
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
@@ -94,7 +96,7 @@ class NeuralSDF(mi.Mesh):
         if not (scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < 1e-3):
             raise ValueError("neural_sdf: to_world may rotate, translate and scale uniformly; it does more")
         super().__init__(props.id() or "neural_sdf", 1, 1, props=props, has_vertex_normals=True)
-        self.to_world = mi.Transform4f(matrix)
+        self.to_world = mi.Transform4f(cast(Any, matrix))  # the stubs leave out float64
         self.to_local = self.to_world.inverse()
         self._matrix_to_local = np.linalg.inv(matrix)
         self.head_shape = HeadShape(avatar.architecture)
@@ -136,7 +138,7 @@ class NeuralSDF(mi.Mesh):
             return t, dr.zeros(mi.Bool, width)
         ray = dr.detach(ray)
         origin, direction, start = (
-            to_columns(dr.gather(type(a), a, index)).numpy().astype(np.float64) for a in (ray.o, ray.d, mi.Float(t))
+            gather_columns(a, index).numpy().astype(np.float64) for a in (ray.o, ray.d, mi.Float(t))
         )
         # From the proxy's hit on: single precision does not resolve 0.01 mm at a camera's distance.
         matrix = self._matrix_to_local
@@ -203,7 +205,7 @@ class NeuralSDF(mi.Mesh):
 
     def _add_attributes(self) -> None:
         """Makes an empty vertex attribute for every baked texture, and tells the textures their names."""
-        self._baked = {}
+        self._baked: dict[str, NeuralAlbedo] = {}
         for texture in self._textures:
             if texture.baked:
                 same = sum(t.kind == texture.kind for t in self._baked.values())

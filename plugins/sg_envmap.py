@@ -1,6 +1,7 @@
 """The emitter `sg_envmap`: an environment of spherical Gaussians."""
 
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ from sira_mi.sg.sampling import LobeMixture
 # Distance of the environment in scene units; a Python emitter is not told the size of its scene.
 FAR_DISTANCE = 1e5
 # Dim and near-constant: the light when no lobes are given.
-DEFAULT_LOBES = ((0.0, 1.0, 0.0, 1e-3, 0.2, 0.2, 0.2),)
+DEFAULT_LOBES = np.array([[0.0, 1.0, 0.0, 1e-3, 0.2, 0.2, 0.2]])
 
 
 class SGEnvmap(mi.Emitter):
@@ -78,13 +79,14 @@ class SGEnvmap(mi.Emitter):
         if "filename" in props:
             lobes = self._read(props["filename"], count)
         else:
-            lobes = check_lobes(np.array(props.get("lobes", mi.TensorXf(DEFAULT_LOBES))), "sg_envmap")
+            lobes = check_lobes(np.array(props["lobes"]) if "lobes" in props else DEFAULT_LOBES, "sg_envmap")
         self.lobes = mi.TensorXf(lobes)
         self._prepare()
 
     @staticmethod
     def _read(filename, count):
-        path = str(mi.file_resolver().resolve(filename))
+        resolver: Any = mi.file_resolver  # a function, which the stubs call an object
+        path = str(resolver().resolve(filename))
         suffix = Path(path).suffix.lower()
         if suffix == ".json":
             return read_lights(path)
@@ -116,7 +118,7 @@ class SGEnvmap(mi.Emitter):
 
     def sample_direction(self, it, sample, active=True):
         direction = dr.normalize(self.world_transform() @ self.mixture.sample(sample, active))
-        ds = dr.zeros(mi.DirectionSample3f)
+        ds: Any = dr.zeros(mi.DirectionSample3f)  # the stubs give its fields other types
         ds.p = dr.fma(direction, FAR_DISTANCE, it.p)
         ds.n, ds.d, ds.dist = -direction, direction, mi.Float(FAR_DISTANCE)
         ds.uv, ds.time, ds.delta = mi.Point2f(0.0), it.time, mi.Bool(False)

@@ -1,5 +1,7 @@
 """The BSDF `sira_bsdf`: diffuse albedo and the simplified Disney specular term of eq. 8."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -66,7 +68,7 @@ class SiraBSDF(mi.BSDF):
         if not 0.0 <= k_s < float("inf"):
             raise InputError(f"sira_bsdf: k_s is {k_s}; it must be finite and not negative")
         self.roughness, self.k_s = mi.Float(roughness), mi.Float(k_s)
-        side = mi.BSDFFlags.FrontSide
+        side: Any = mi.BSDFFlags.FrontSide  # flags combine to integers
         if any(texture.is_spatially_varying() for texture in (self.diffuse_albedo, self.specular_albedo)):
             side = side | mi.BSDFFlags.SpatiallyVarying
         self.m_components = [mi.BSDFFlags.GlossyReflection | side, mi.BSDFFlags.DiffuseReflection | side]
@@ -130,7 +132,7 @@ class SiraBSDF(mi.BSDF):
         with dr.suspend_grad():
             half = brdf.sample_distribution(sample2, self.roughness)
             wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-        bs = dr.zeros(mi.BSDFSample3f)
+        bs: Any = dr.zeros(mi.BSDFSample3f)  # the stubs give its fields other types
         bs.wo = wo
         bs.pdf = self._density(si, wo, share, active)
         bs.eta = 1.0

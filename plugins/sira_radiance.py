@@ -2,9 +2,9 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.avatar.decoders import render_radiance
-from sira_mi.avatar.file import load_avatar
+from sira_mi.avatar.file import AvatarArchitecture, load_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.columns import from_columns, normalise, scatter_columns, to_columns
+from sira_mi.fields.columns import from_columns, gather_columns, normalise, scatter_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit, refine_approach
@@ -71,20 +71,20 @@ class SiraRadiance(mi.SamplingIntegrator):
         self.mask_sharpness = float(props.get("mask_sharpness", 50.0))
         if not self.mask_sharpness > 0:
             raise ValueError(f"sira_radiance: mask_sharpness is {self.mask_sharpness}, must be positive")
-        self.architecture = None
+        self.architecture: AvatarArchitecture | None = None
         if path:
             self._load(path)
 
-    def _load(self, path: str) -> None:
+    def _load(self, path: str) -> AvatarArchitecture:
         avatar = load_avatar(path)
         self.architecture = avatar.architecture
         self.rendering = mi.Float(avatar.tensors["rendering"])
         self.z_r = mi.Float(avatar.tensors["z_r"])
+        return avatar.architecture
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         head = find_head(scene, "sira_radiance")
-        if self.architecture is None:
-            self._load(head.avatar_path)
+        architecture = self.architecture or self._load(head.avatar_path)
         ray = mi.Ray3f(dr.detach(ray))
         width = dr.width(ray.o, ray.d)
         local = head.to_local @ ray
@@ -95,11 +95,11 @@ class SiraRadiance(mi.SamplingIntegrator):
         color = dr.zeros(mi.Color3f, width)
         index = dr.compress(hit)
         if dr.width(index) > 0:
-            origin, direction, parameter = (to_columns(dr.gather(type(a), a, index)) for a in (local.o, local.d, t))
+            origin, direction, parameter = (gather_columns(a, index) for a in (local.o, local.d, t))
             x = differentiable_hit(field, origin, direction, parameter)
             _, gradient, x_ref, gamma = surface(field, x)
-            network = layers(self.architecture.networks["rendering"], self.rendering, self.z_r)
-            octaves = self.architecture.rendering_octaves
+            network = layers(architecture.networks["rendering"], self.rendering, self.z_r)
+            octaves = architecture.rendering_octaves
             radiance = render_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
             color = scatter_columns(radiance, index, width, mi.Color3f)
         mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
@@ -116,13 +116,14 @@ class SiraRadiance(mi.SamplingIntegrator):
         t = closest_approach(head.grid, local.o, local.d, near, far, inside)
         outline = dr.compress(inside & (dr.abs(head.grid(local.o + t * local.d, inside)) < OUTLINE))
         if dr.width(outline) > 0:
-            columns = (to_columns(dr.gather(type(a), a, outline)) for a in (local.o, local.d, t))
-            dr.scatter(t, from_columns(refine_approach(field, *columns, head.voxel), mi.Float), outline)
+            origin, direction, near_t = (gather_columns(a, outline) for a in (local.o, local.d, t))
+            approach = refine_approach(field, origin, direction, near_t, head.voxel)
+            dr.scatter(t, from_columns(approach, mi.Float), outline)
             t = dr.clip(t, near, far)
         index = dr.compress(inside)
         closest = dr.full(mi.Float, FAR, width)
         if dr.width(index) > 0:
-            x = to_columns(dr.gather(mi.Point3f, mi.Point3f(local.o + t * local.d), index))
+            x = gather_columns(mi.Point3f(local.o + t * local.d), index)
             dr.scatter(closest, from_columns(signed_distance(field, x), mi.Float), index)
         return closest
 

@@ -10,7 +10,14 @@ import numpy as np
 from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import evaluate_in_chunks, from_columns, normalise, scatter_columns, to_columns
+from sira_mi.fields.columns import (
+    evaluate_in_chunks,
+    from_columns,
+    gather_columns,
+    normalise,
+    scatter_columns,
+    to_columns,
+)
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
@@ -234,11 +241,12 @@ def find_hits(scene, head, ray, active, samples: int, exact: bool) -> Hits:
         dr.eval(si, shaded)
     representative = None
     if samples > 1:
-        arrays = (head.to_local @ si.p, si.sh_frame.n, shaded)
-        representative = mi.UInt32(representative_samples(*(a.numpy() for a in arrays), samples))
+        position, normal, hit = (a.numpy() for a in (head.to_local @ si.p, si.sh_frame.n, shaded))
+        representative = mi.UInt32(representative_samples(position, normal, hit, samples))
         shaded &= representative == dr.arange(mi.UInt32, dr.width(shaded))
     if exact:
-        return Hits(*head.refine(ray, si.t, shaded), None, representative)
+        t, shaded = head.refine(ray, si.t, shaded)
+        return Hits(t, shaded, None, representative)
     return Hits(si.t, shaded, si, representative)
 
 
@@ -264,7 +272,7 @@ class HeadShader:
     def shade(self, ray, hits: Hits, index):
         """At the exact hits of the rays `index`."""
         local = self.head.to_local @ ray
-        origin, direction, t = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, hits.t))
+        origin, direction, t = (gather_columns(v, index) for v in (local.o, local.d, hits.t))
         if self.attached:
             return self._shade_field(differentiable_hit(self.field, origin, direction, dr.detach(t)), direction)
         x = on_ray(origin, direction, t)
@@ -274,9 +282,9 @@ class HeadShader:
         """At the hits on the mesh of the rays `index`, with its normals; without gradients."""
         si = dr.gather(mi.SurfaceInteraction3f, hits.on_mesh, index)
         to_local = mi.TensorXf(np.ascontiguousarray(rotation_of(self.head.to_world).T))
-        local = dr.gather(mi.Vector3f, (self.head.to_local @ ray).d, index)
+        direction = gather_columns((self.head.to_local @ ray).d, index)
         x, normal = to_columns(self.head.to_local @ si.p), to_local @ to_columns(si.sh_frame.n)
-        columns = [x, to_columns(local), normal, *mesh_albedos(self.head, self.bsdf, si, x)]
+        columns = [x, direction, normal, *mesh_albedos(self.head, self.bsdf, si, x)]
         if (refinement := self.integrator.refinement) is not None:
             factor = evaluate_in_chunks(lambda p: refinement.factor(*deform(self.field, p)), x.numpy())[0]
             columns.append(mi.TensorXf(factor))
@@ -335,7 +343,7 @@ def mesh_albedos(head, bsdf, si, x) -> list:
     coordinates: of the networks, or looked up at `si` where a texture is baked or of another kind."""
     textures = (bsdf.diffuse_albedo, bsdf.specular_albedo)
     by_network = [isinstance(texture, NeuralAlbedo) and not texture.baked for texture in textures]
-    inputs = evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy()) if any(by_network) else None
+    inputs = evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy()) if any(by_network) else []
     result = []
     with dr.suspend_grad():
         for texture, neural, rows in zip(textures, by_network, (3, 1), strict=True):

@@ -109,6 +109,16 @@ def reprojected(head, start: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return x.astype(np.float32)
 
 
+def moved(head, key, value, x, gradient):
+    """`reprojected` with another value of one parameter."""
+    kept = head.parameters[key]
+    head.parameters[key] = mi.Float(value)
+    try:
+        return reprojected(head, x, gradient)
+    finally:
+        head.parameters[key] = kept
+
+
 def check_image_derivatives(avatar, scene, spp: int, change: float, tolerance: float, weight: np.ndarray):
     params, head = mi.traverse(scene), head_of(scene)
     weight = mi.TensorXf(weight.astype(np.float32))
@@ -124,10 +134,8 @@ def check_image_derivatives(avatar, scene, spp: int, change: float, tolerance: f
     for key in FIELD:
 
         def loss(value, key=key):
-            setattr(head, key, mi.Float(value))
-            params["head.vertex_positions"] = mi.Float(reprojected(head, start, gradient).T.ravel())
+            params["head.vertex_positions"] = mi.Float(moved(head, key, value, start, gradient).T.ravel())
             params.update()
-            setattr(head, key, mi.Float(avatar.tensors[key]))
             image = mi.render(scene, spp=4 * spp, seed=7)
             return float(dr.mean(image[:, :, :3] * weight, axis=None).numpy().item())
 
@@ -150,8 +158,7 @@ def test_vertices_move_as_the_level_set_does(avatar, scene):
         dr.backward(dr.mean(mi.traverse(head)["vertex_positions"] * mi.Float(weight.ravel())))
 
         def loss(value, key=key, weight=weight, start=start, gradient=gradient):
-            setattr(head, key, mi.Float(value))
-            return float((reprojected(head, start, gradient).T * weight).mean(dtype=np.float64))
+            return float((moved(head, key, value, start, gradient).T * weight).mean(dtype=np.float64))
 
         ad, difference = slopes(loss, avatar.tensors[key], dr.grad(value).numpy(), 3e-4)
         params[f"head.{key}"] = mi.Float(avatar.tensors[key])

@@ -1,6 +1,7 @@
 """Mesh files of a head."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sira_mi.portrait.load import linear_to_srgb
 def write_mesh(path: Path, shape) -> None:
     """A PLY of a `neural_sdf` in metres (+y up, facing +z), with the field's normals and, as vertex colours, the sRGB
     diffuse albedo."""
-    import trimesh
+    import trimesh  # takes seconds
 
     vertices = shape.vertices()
     field, texture = shape.field(), shape.bsdf().diffuse_albedo
@@ -31,4 +32,5 @@ def write_mesh(path: Path, shape) -> None:
         vertex_colors=(linear_to_srgb(np.clip(albedo.T, 0, 1)) * 255 + 0.5).astype(np.uint8),
         process=False,
     )
-    write_through(path, lambda p: p.write_bytes(mesh.export(file_type="ply", vertex_normal=True)))
+    data: Any = mesh.export(file_type="ply", vertex_normal=True)  # bytes, of all that trimesh may return
+    write_through(path, lambda p: p.write_bytes(data))

@@ -25,6 +25,11 @@ def to_columns(vector):
     return dr.concat([mi.TensorXf(mi.Float(c) + dr.zeros(mi.Float, width), (1, width)) for c in vector], axis=0)
 
 
+def gather_columns(vector, index):
+    """`to_columns` of some lanes of a vector, point or Float."""
+    return to_columns(dr.gather(type(vector), vector, index))
+
+
 def from_columns(tensor, kind):
     """Tensor [rows, N] -> `kind`, a vector type of that many coordinates, or Float for one row."""
     rows, width = tensor.shape

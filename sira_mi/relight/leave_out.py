@@ -24,7 +24,8 @@ from sira_mi.relight.surface import (
     shadow_error,
     sharing_error,
 )
-from sira_mi.sg.fit_environment import pixel_directions, sphere_integral
+from sira_mi.sg.fit_environment import pixel_directions
+from sira_mi.sg.lobes import lobe_integral
 from sira_mi.sg.multisampling import REACH
 from sira_mi.sg.shading import shade_tensor
 from sira_mi.sg.weak_lobes import radiance_bounds, select_lobes, white_radiance
@@ -136,7 +137,7 @@ def approximate_lobes(light: Light) -> np.ndarray:
     filled = np.linalg.norm(axis, axis=1) > 0
     axis, flux = axis[filled], flux[filled]
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    amplitude = flux / sphere_integral(np.array(_IMAGE_SHARPNESS))
+    amplitude = flux / lobe_integral(np.array(_IMAGE_SHARPNESS))
     return np.column_stack([axis, np.full(len(axis), _IMAGE_SHARPNESS), amplitude]).astype(np.float32)
 
 

@@ -10,49 +10,51 @@ import math
 import drjit as dr
 import mitsuba as mi
 
+from sira_mi.sg.arrays import Float, Point2f, Vector3f
+
 MINIMUM_ROUGHNESS = 0.02
 MAXIMUM_ROUGHNESS = 1.0
 
 
-def distribution_sharpness(roughness: "mi.Float") -> "mi.Float":
+def distribution_sharpness(roughness: Float) -> Float:
     """λ = 2/r⁴ of the normal distribution."""
     return 2.0 / dr.square(dr.square(roughness))
 
 
-def distribution(one_minus_cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
+def distribution(one_minus_cosine: Float, roughness: Float) -> Float:
     """D(h) per steradian as a function of 1 − h·n, which the caller has without cancellation as ½|h − n|²."""
     sharpness = distribution_sharpness(roughness)
     return sharpness * (0.5 / math.pi) * dr.exp(-sharpness * one_minus_cosine)
 
 
-def log_fresnel_weight(cosine: "mi.Float") -> "mi.Float":
+def log_fresnel_weight(cosine: Float) -> Float:
     """Natural log of P(v·h)."""
     return -math.log(2.0) * (5.55473 * cosine + 6.8316) * cosine
 
 
-def fresnel_weight(cosine: "mi.Float") -> "mi.Float":
+def fresnel_weight(cosine: Float) -> Float:
     """P(v·h) of F = s + (1 − s) P: the spherical-Gaussian fit of Schlick's (1 − v·h)⁵."""
     return dr.exp(log_fresnel_weight(cosine))
 
 
-def fresnel(specular_albedo: "mi.Float", cosine: "mi.Float") -> "mi.Float":
+def fresnel(specular_albedo: Float, cosine: Float) -> Float:
     """F = s + (1 − s) P(v·h)."""
     return dr.lerp(fresnel_weight(cosine), 1.0, specular_albedo)
 
 
-def masking(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
+def masking(cosine: Float, roughness: Float) -> Float:
     """g(c)/c = 1 / (c(1 − k) + k) with k = (r + 1)²/8; the G of one direction over its cosine."""
     k = dr.square(roughness + 1.0) / 8.0
     return dr.rcp(dr.fma(cosine, 1.0 - k, k))
 
 
 def specular_brdf(
-    normal: "mi.Vector3f",
-    view: "mi.Vector3f",
-    light: "mi.Vector3f",
-    specular_albedo: "mi.Float",
-    roughness: "mi.Float",
-) -> "mi.Float":
+    normal: Vector3f,
+    view: Vector3f,
+    light: Vector3f,
+    specular_albedo: Float,
+    roughness: Float,
+) -> Float:
     """f^s per steradian for unit vectors, 0 unless `view` and `light` are both above the surface."""
     cos_view, cos_light = dr.dot(normal, view), dr.dot(normal, light)
     above = (cos_view > 0.0) & (cos_light > 0.0)
@@ -63,7 +65,7 @@ def specular_brdf(
     return dr.select(above, value, 0.0)
 
 
-def sample_distribution(sample: "mi.Point2f", roughness: "mi.Float") -> "mi.Vector3f":
+def sample_distribution(sample: Point2f, roughness: Float) -> Vector3f:
     """A half vector around +z with the density D(h) over the sphere, from two uniform numbers."""
     sharpness = distribution_sharpness(roughness)
     # D is normalised up to exp(−2λ) <= e⁻⁴; the cosine's distribution is truncated to the sphere exactly.
@@ -73,9 +75,7 @@ def sample_distribution(sample: "mi.Point2f", roughness: "mi.Float") -> "mi.Vect
     return mi.Vector3f(sine * cos_phi, sine * sin_phi, 1.0 - gap)
 
 
-def reflected_density(
-    normal: "mi.Vector3f", view: "mi.Vector3f", light: "mi.Vector3f", roughness: "mi.Float"
-) -> "mi.Float":
+def reflected_density(normal: Vector3f, view: Vector3f, light: Vector3f, roughness: Float) -> Float:
     """Density per steradian of `view` reflected about a half vector of `sample_distribution`.
 
     h and −h reflect alike, so both count; the Jacobian is 1/(4 |v·h|)."""

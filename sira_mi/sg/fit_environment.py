@@ -14,7 +14,7 @@ import numpy as np
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.directions import fibonacci_directions
-from sira_mi.sg.lobes import evaluate_lobes
+from sira_mi.sg.lobes import evaluate_lobes, lobe_integral
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,6 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return directions, (edges[:-1] - edges[1:]) * 2.0 * np.pi / width
 
 
-def sphere_integral(sharpness: np.ndarray) -> np.ndarray:
-    """∫ exp(λ(ω·ξ − 1)) dω over the sphere, steradians."""
-    return -2.0 * np.pi * np.expm1(-2.0 * sharpness) / sharpness
-
-
 def total_light(image: np.ndarray) -> np.ndarray:
     """∫ l dω of each channel `[3]` of an environment `[H, W, 3]`."""
     _, solid_angle = pixel_directions(*image.shape[:2])
@@ -62,7 +57,7 @@ def render_environment(lobes: np.ndarray, height: int) -> np.ndarray:
     lobes = np.asarray(lobes, np.float64).copy()
     pixel = np.pi / height
     sharpness = 1.0 / (1.0 / lobes[:, 3] + np.where(lobes[:, 3] * pixel**2 > 0.1, (0.5 * pixel) ** 2, 0.0))
-    lobes[:, 4:] *= (sphere_integral(lobes[:, 3]) / sphere_integral(sharpness))[:, None]
+    lobes[:, 4:] *= (lobe_integral(lobes[:, 3]) / lobe_integral(sharpness))[:, None]
     lobes[:, 3] = sharpness
     directions, _ = pixel_directions(height, 2 * height)
     return np.stack([evaluate_lobes(lobes, row) for row in directions]).astype(np.float32)
@@ -79,7 +74,7 @@ def _take_suns(image, settings):
     image = image.astype(np.float64)
     directions, solid_angle = pixel_directions(*image.shape[:2])
     weight = np.broadcast_to(solid_angle[:, None], image.shape[:2])
-    suns = []
+    suns: list[list[float]] = []
     total = (image @ LUMINANCE * weight).sum()
     mean = total / (4.0 * np.pi)
     while len(suns) < settings.lobes // 4:
@@ -97,7 +92,7 @@ def _take_suns(image, settings):
         mean_direction = share @ directions[inside] / share.sum()
         length = np.linalg.norm(mean_direction)
         sharpness = np.clip(_sharpness_of_length(length), 1.0, settings.maximum_sharpness)
-        suns.append([*(mean_direction / length), sharpness, *(flux / sphere_integral(sharpness))])
+        suns.append([*(mean_direction / length), sharpness, *(flux / lobe_integral(sharpness))])
         image[inside] = np.minimum(image[inside], background)
     return np.array(suns).reshape(-1, 7), image
 
@@ -140,7 +135,7 @@ def _solve_amplitudes(axes, sharpness, directions, weight, radiance, flux):
     from scipy.optimize import nnls
 
     basis = np.exp(sharpness * (np.clip(directions @ axes.T, -1.0, 1.0) - 1.0))
-    energy = sphere_integral(sharpness)
+    energy = lobe_integral(sharpness)
     root = np.sqrt(weight)[:, None]
     scale = np.sqrt(weight.sum() / len(weight)) * len(weight)
     matrix = np.concatenate([basis * root, scale * energy[None] / (4.0 * np.pi)])
@@ -197,6 +192,6 @@ def fit_environment(image: np.ndarray, settings: EnvironmentFit | None = None) -
         axes, sharpness = _refine(axes, sharpness, amplitude, *problem, settings)
         amplitude = _solve_amplitudes(axes, sharpness, *problem, rest_flux)
     lobes = np.concatenate([np.concatenate([axes, sharpness[:, None], amplitude], axis=1), suns])
-    light = sphere_integral(lobes[:, 3]) @ lobes[:, 4:]
+    light = lobe_integral(lobes[:, 3]) @ lobes[:, 4:]
     lobes[:, 4:] *= np.where(light > 0.0, flux / np.maximum(light, 1e-300), 1.0)
     return lobes.astype(np.float32)

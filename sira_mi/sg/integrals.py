@@ -16,7 +16,8 @@ Accurate Light Integration" (2018); forms and coefficients are this project's ow
 import math
 
 import drjit as dr
-import mitsuba as mi
+
+from sira_mi.sg.arrays import Float, Vector3f
 
 # Even polynomials in the cosine (rows) with coefficients in y = λ/(λ + k) (columns, constant first), fitted to
 # 600-point Gauss-Legendre quadrature over 1e-3 <= λ <= 1e5.
@@ -62,7 +63,7 @@ def _normal_density(x):
     return dr.exp(-0.5 * dr.square(x)) * (1.0 / math.sqrt(2.0 * math.pi))
 
 
-def clamped_mean(x: "mi.Float") -> "mi.Float":
+def clamped_mean(x: Float) -> Float:
     """E max(x + N(0, 1), 0) = x Φ(x) + φ(x), to a relative error of 1e-6 for every x."""
     distance = dr.abs(x)
     y = dr.rcp(dr.fma(distance, _TAIL_SCALE, 1.0))
@@ -74,7 +75,7 @@ def _logistic_cumulative(x):
     return dr.rcp(1.0 + dr.exp(-x * dr.fma(0.070565992, dr.square(x), 1.5976)))
 
 
-def sphere_integral(sharpness: "mi.Float") -> "mi.Float":
+def sphere_integral(sharpness: Float) -> Float:
     """∫ exp(λ(ω·ξ − 1)) dω over the sphere, steradians: −2π expm1(−2λ)/λ, by its series for small λ."""
     x = 2.0 * sharpness
     series = _polynomial(x, [(-1.0) ** k / math.factorial(k + 1) for k in range(9)])
@@ -82,7 +83,7 @@ def sphere_integral(sharpness: "mi.Float") -> "mi.Float":
     return 4.0 * math.pi * dr.select(sharpness < _SERIES_INTEGRAL, series, quotient)
 
 
-def mean_over_sharpness(sharpness: "mi.Float") -> "mi.Float":
+def mean_over_sharpness(sharpness: Float) -> Float:
     """A(λ)/λ with A = coth λ − 1/λ, the length of a lobe's mean direction; also the variance across its axis."""
     square = dr.square(sharpness)
     series = _polynomial(square, (1 / 3, -1 / 45, 2 / 945, -1 / 4725, 2 / 93555))
@@ -93,8 +94,8 @@ def mean_over_sharpness(sharpness: "mi.Float") -> "mi.Float":
 
 
 def product(
-    axis_a: "mi.Vector3f", sharpness_a: "mi.Float", axis_b: "mi.Vector3f", sharpness_b: "mi.Float"
-) -> tuple["mi.Vector3f", "mi.Float", "mi.Float"]:
+    axis_a: Vector3f, sharpness_a: Float, axis_b: Vector3f, sharpness_b: Float
+) -> tuple[Vector3f, Float, Float]:
     """The product of two lobes of amplitude 1: the lobe's unit axis, sharpness λ_m and log amplitude λ_m − λ_a − λ_b.
 
     λ_m = |λ_a ξ_a + λ_b ξ_b|, and the log is −λ_a λ_b |ξ_a − ξ_b|² / (λ_m + λ_a + λ_b): no cancellation."""
@@ -115,15 +116,13 @@ def product(
     return dr.fma(mean, excess, mean), sharpness, log_amplitude
 
 
-def inner_product(
-    axis_a: "mi.Vector3f", sharpness_a: "mi.Float", axis_b: "mi.Vector3f", sharpness_b: "mi.Float"
-) -> "mi.Float":
+def inner_product(axis_a: Vector3f, sharpness_a: Float, axis_b: Vector3f, sharpness_b: Float) -> Float:
     """∫ of the product of two lobes of amplitude 1 over the sphere, steradians."""
     _, sharpness, log_amplitude = product(axis_a, sharpness_a, axis_b, sharpness_b)
     return dr.exp(log_amplitude) * sphere_integral(sharpness)
 
 
-def hemisphere_integral(cosine: "mi.Float", sharpness: "mi.Float") -> "mi.Float":
+def hemisphere_integral(cosine: Float, sharpness: Float) -> Float:
     """∫ exp(λ(ω·ξ − 1)) dω over the hemisphere around n, steradians, for `cosine` = ξ·n in [−1, 1]."""
     ratio = _even_polynomial(cosine, sharpness, _STEP_HALF_POINT, _STEP_RATIO)
     # Slope at the equator for λ → 0, c λ/4 = φ(0) t, joined to the planar limit t = c √λ.
@@ -131,7 +130,7 @@ def hemisphere_integral(cosine: "mi.Float", sharpness: "mi.Float") -> "mi.Float"
     return sphere_integral(sharpness) * _logistic_cumulative(cosine * slope * ratio)
 
 
-def cosine_integral(cosine: "mi.Float", sharpness: "mi.Float") -> "mi.Float":
+def cosine_integral(cosine: Float, sharpness: Float) -> Float:
     """∫ exp(λ(ω·ξ − 1)) (ω·n)₊ dω, steradians, for `cosine` = ξ·n in [−1, 1]."""
     variance = mean_over_sharpness(sharpness)
     mean = variance * sharpness * cosine

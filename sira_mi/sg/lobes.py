@@ -1,17 +1,21 @@
-"""Spherical-Gaussian lobes: the tensor convention, evaluation, initial directions and unconstrained parameters.
+"""Spherical-Gaussian lobes: the tensor convention and evaluation.
 
 A lobe is G(d) = μ exp(λ(d·ξ − 1)) with unit axis ξ, sharpness λ > 0 and linear RGB amplitude μ ≥ 0 (radiance). A set of
 lobes is one tensor `lobes` `[N_l, 7]`: axis (3, normalised whenever it is used), sharpness, amplitude (3).
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.directions import fibonacci_directions
+from sira_mi.sg.arrays import Color3f, Float, TensorXf, UInt32, Vector3f
 
 
-def lobe_count(lobes: "mi.TensorXf") -> int:
+def lobe_count(lobes: TensorXf) -> int:
     """N_l of a tensor `[N_l, 7]`; ValueError for any other shape or for no lobe at all."""
     shape = tuple(lobes.shape)
     if len(shape) != 2 or shape[1] != 7 or shape[0] == 0:
@@ -19,30 +23,26 @@ def lobe_count(lobes: "mi.TensorXf") -> int:
     return shape[0]
 
 
-def unpack_raw(packed: "mi.Float", index: "mi.UInt32 | int") -> tuple["mi.Vector3f", "mi.Float", "mi.Color3f"]:
+def unpack_raw(packed: Float, index: UInt32) -> tuple[Vector3f, Float, Color3f]:
     """Axis as stored, sharpness and amplitude of lobe `index` of the flat array behind `lobes` (`lobes.array`)."""
     offset = mi.UInt32(index) * 7
     value = [dr.gather(mi.Float, packed, offset + k) for k in range(7)]
     return mi.Vector3f(*value[:3]), value[3], mi.Color3f(*value[4:])
 
 
-def unpack_lobe(packed: "mi.Float", index: "mi.UInt32 | int") -> tuple["mi.Vector3f", "mi.Float", "mi.Color3f"]:
+def unpack_lobe(packed: Float, index: UInt32) -> tuple[Vector3f, Float, Color3f]:
     """Unit axis, sharpness and amplitude of lobe `index` of the flat array behind `lobes`."""
     axis, sharpness, amplitude = unpack_raw(packed, index)
     return dr.normalize(axis), sharpness, amplitude
 
 
-def pack_lobes(axis: "mi.Vector3f", sharpness: "mi.Float", amplitude: "mi.Color3f") -> "mi.TensorXf":
-    """The tensor `[N_l, 7]` of N_l-wide arrays; differentiable, and the axes are stored normalised."""
-    axis = dr.normalize(axis)
-    columns = mi.ArrayXf([axis.x, axis.y, axis.z, sharpness, amplitude.x, amplitude.y, amplitude.z])
-    count = dr.width(columns)
-    return mi.TensorXf(dr.ravel(columns), shape=(count, 7))
+def interleave(columns: Sequence[Float]) -> Float:
+    """The flat array of n records of columns that are n wide, the layout behind `lobes`."""
+    array: Any = mi.ArrayXf  # the stubs call it an object
+    return dr.ravel(array(list(columns)))
 
 
-def evaluate_lobe(
-    direction: "mi.Vector3f", axis: "mi.Vector3f", sharpness: "mi.Float", amplitude: "mi.Color3f"
-) -> "mi.Color3f":
+def evaluate_lobe(direction: Vector3f, axis: Vector3f, sharpness: Float, amplitude: Color3f) -> Color3f:
     """G(d) = μ exp(λ(d·ξ − 1)) for unit `direction` and `axis`; d·ξ − 1 = −½|d − ξ|² keeps sharp lobes exact."""
     return amplitude * dr.exp(-0.5 * sharpness * dr.squared_norm(direction - axis))
 
@@ -54,34 +54,16 @@ def evaluate_lobes(lobes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.exp(lobes[:, 3] * (cosine - 1.0)) @ lobes[:, 4:]
 
 
+def lobe_integral(sharpness: np.ndarray) -> np.ndarray:
+    """∫ exp(λ(ω·ξ − 1)) dω over the sphere, steradians; NumPy, for sharpness > 0."""
+    return -2.0 * np.pi * np.expm1(-2.0 * sharpness) / sharpness
+
+
 def initial_lobes(count: int, energy: float = 2.0 * np.pi, seed: int = 0) -> np.ndarray:
     """PhySG's start `[count, 7]` (float32): Fibonacci axes, sharpness 20 + |100·N(0, 1)|, grey, `energy` in all.
 
     `energy` is the total ∫ l dω of each channel, radiance times steradians, shared equally by the lobes."""
     sharpness = 20.0 + np.abs(100.0 * np.random.default_rng(seed).standard_normal(count))
-    amplitude = energy / count * sharpness / (-2.0 * np.pi * np.expm1(-2.0 * sharpness))
+    amplitude = energy / count / lobe_integral(sharpness)
     columns = [fibonacci_directions(count), sharpness[:, None], np.repeat(amplitude[:, None], 3, axis=1)]
     return np.concatenate(columns, axis=1).astype(np.float32)
-
-
-def softplus(x: "mi.Float") -> "mi.Float":
-    """log(1 + exp(x)), positive and free of overflow; also for tensors."""
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
-
-
-def constrain(raw: "mi.TensorXf") -> "mi.TensorXf":
-    """Lobes `[N_l, 7]` of unconstrained parameters of that shape: axis as it is (scale is free), sharpness
-    exp(x), amplitude softplus(x). Differentiable; the inverse is `unconstrain`."""
-    count = lobe_count(raw)
-    value = mi.TensorXf(raw)
-    axis, sharpness, amplitude = value[:, :3], dr.exp(value[:, 3:4]), softplus(value[:, 4:])
-    parts = [dr.reshape(mi.TensorXf, part, (count, -1)) for part in (axis, sharpness, amplitude)]
-    return dr.concat(parts, axis=1)
-
-
-def unconstrain(lobes: np.ndarray, floor: float = 1e-6) -> np.ndarray:
-    """The parameters `[N_l, 7]` (float32) that `constrain` maps to `lobes`; amplitudes below `floor` become it."""
-    lobes = np.asarray(lobes, np.float64)
-    amplitude = np.maximum(lobes[:, 4:], floor)
-    inverse = amplitude + np.log(-np.expm1(-amplitude))
-    return np.concatenate([lobes[:, :3], np.log(lobes[:, 3:4]), inverse], axis=1).astype(np.float32)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import from_columns, to_columns
+from sira_mi.sg.arrays import Float, TensorXf, Vector3f
 from sira_mi.sg.scene_shading import shade_scenes
 from sira_mi.sg.shading import irradiance as closed_form_irradiance
 from sira_mi.sg.shading import shade
@@ -19,23 +20,23 @@ from sira_mi.sg.visibility import Visibility
 class Material(NamedTuple):
     """What eq. 8 needs of the surface at N points."""
 
-    diffuse_albedo: "mi.TensorXf"  # [3, N]
-    specular_albedo: "mi.TensorXf | None"  # [1, N] reflectance at normal incidence; None leaves the specular term out
-    roughness: "mi.Float | float"
-    k_s: "mi.TensorXf | float"  # weight of the specular term; a number or [1, 1]
+    diffuse_albedo: TensorXf  # [3, N]
+    specular_albedo: TensorXf | None  # [1, N] reflectance at normal incidence; None leaves the specular term out
+    roughness: Float
+    k_s: TensorXf  # weight of the specular term; a number or [1, 1]
 
 
 class Radiance(NamedTuple):
     """Radiance [3, N] by the two terms of eq. 8."""
 
-    diffuse: "mi.TensorXf"
-    specular: "mi.TensorXf"
+    diffuse: TensorXf
+    specular: TensorXf
 
 
 def reflect(
     material: Material,
-    irradiance: "mi.TensorXf",
-    specular: "mi.TensorXf | None",
+    irradiance: TensorXf,
+    specular: TensorXf | None,
     visibility: Visibility | None = None,
 ) -> Radiance:
     """Eq. 8, a/π E + k_s ∫ l f^s (n·ω)₊ dω, of the two integrals [3, N] of the unoccluded light. With `visibility` they
@@ -50,10 +51,10 @@ def reflect(
 
 
 def reflected_radiance(
-    normals: "mi.TensorXf",
-    views: "mi.TensorXf",
+    normals: TensorXf,
+    views: TensorXf,
     material: Material,
-    lobes: "mi.TensorXf",
+    lobes: TensorXf,
     visibility: Visibility | None = None,
 ) -> Radiance:
     """Eq. 8 in closed form at points under the light `lobes` [N_l, 7]; without `visibility` nothing blocks it. A normal
@@ -61,21 +62,23 @@ def reflected_radiance(
     if material.specular_albedo is None:
         irradiance = to_columns(closed_form_irradiance(from_columns(normals, mi.Vector3f), lobes))
         return reflect(material, irradiance, None, visibility)
-    parts = shade(*_shading_points(normals, views, material), mi.Float(material.roughness), lobes)
-    return reflect(material, *map(to_columns, parts), visibility)
+    point = _shading_points(normals, views, material)
+    irradiance, specular = map(to_columns, shade(*point, mi.Float(material.roughness), lobes))
+    return reflect(material, irradiance, specular, visibility)
 
 
 def radiance_of_scenes(
-    normals: "mi.TensorXf", views: "mi.TensorXf", material: Material, lobes: "mi.TensorXf", scenes: int
+    normals: TensorXf, views: TensorXf, material: Material, lobes: TensorXf, scenes: int
 ) -> Radiance:
     """`reflected_radiance` without visibility at the points of `scenes` S scenes in one launch: each scene's points are
     consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
     differentiable in albedos and lobes."""
-    parts = shade_scenes(*_shading_points(normals, views, material), material.roughness, lobes, scenes)
-    return reflect(material, *map(to_columns, parts))
+    point = _shading_points(normals, views, material)
+    irradiance, specular = map(to_columns, shade_scenes(*point, material.roughness, lobes, scenes))
+    return reflect(material, irradiance, specular)
 
 
-def _shading_points(normals, views, material):
+def _shading_points(normals, views, material) -> tuple[Vector3f, Vector3f, Float]:
     """Normal, direction to the camera and specular albedo as Dr.Jit vectors."""
     return (
         from_columns(normals, mi.Vector3f),

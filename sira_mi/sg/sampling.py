@@ -4,10 +4,13 @@ A normalised lobe is a von Mises-Fisher density; its cosine has an invertible di
 1 − cos θ = −log(1 − u + u e^{−2λ})/λ. All steps are stable in single precision for sharpness from 0 to 1e7.
 """
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
 from sira_mi.conventions import LUMINANCE
+from sira_mi.sg.arrays import Bool, Color3f, Float, Point2f, TensorXf, UInt32, Vector3f
 from sira_mi.sg.integrals import sphere_integral
 from sira_mi.sg.lobes import evaluate_lobe, lobe_count, unpack_lobe, unpack_raw
 
@@ -15,14 +18,14 @@ from sira_mi.sg.lobes import evaluate_lobe, lobe_count, unpack_lobe, unpack_raw
 _SERIES = 0.02
 
 
-def lobe_energy(lobes: "mi.TensorXf") -> "mi.Float":
+def lobe_energy(lobes: TensorXf) -> Float:
     """Luminance of each lobe's integral over the sphere, `[N_l]`: the weights of the mixture."""
     count = lobe_count(lobes)
     _, sharpness, amplitude = unpack_lobe(lobes.array, dr.arange(mi.UInt32, count))
     return sphere_integral(sharpness) * dr.dot(amplitude, mi.Color3f(LUMINANCE))
 
 
-def sample_lobe(axis: "mi.Vector3f", sharpness: "mi.Float", sample: "mi.Point2f") -> "mi.Vector3f":
+def sample_lobe(axis: Vector3f, sharpness: Float, sample: Point2f) -> Vector3f:
     """A direction with the density exp(λ(ω·ξ − 1)) / ∫, from two uniform numbers."""
     u = sample.x
     safe = dr.maximum(sharpness, _SERIES)
@@ -73,7 +76,8 @@ class _EvaluateMixture(dr.CustomOp):
             self.set_grad_out(dr.forward_to(result))
 
     def backward(self):
-        gradient = self.grad_out()[0]
+        gradients: Any = self.grad_out()
+        gradient = gradients[0]
 
         def body(index, total):
             with dr.resume_grad():
@@ -102,7 +106,7 @@ class LobeMixture:
 
     The lobes keep their derivatives in what `evaluate` returns; sampling and density are detached from them."""
 
-    def __init__(self, lobes: "mi.TensorXf"):
+    def __init__(self, lobes: TensorXf):
         self.count = lobe_count(lobes)
         self.lobes = lobes
         with dr.suspend_grad():
@@ -110,17 +114,17 @@ class LobeMixture:
             # Black light has to be sampled somehow, and a distribution needs a positive sum.
             energy = dr.select(dr.max(energy) > 0.0, energy, 1.0)
             self.distribution = mi.DiscreteDistribution(energy)
-            index = dr.arange(mi.UInt32, self.count)
+            index: UInt32 = dr.arange(mi.UInt32, self.count)
             sharpness = unpack_raw(dr.detach(lobes).array, index)[1]
             self.density = self.distribution.eval_pmf_normalized(index) / sphere_integral(sharpness)
             dr.eval(self.density)
 
-    def evaluate(self, direction: "mi.Vector3f") -> tuple["mi.Color3f", "mi.Float"]:
+    def evaluate(self, direction: Vector3f) -> tuple[Color3f, Float]:
         """Radiance `[..., 3]` and the density of `sample`, per steradian, in a unit direction."""
         anchor = dr.gather(mi.Float, self.lobes.array, mi.UInt32(0))
         return dr.custom(_EvaluateMixture, direction, anchor, self)
 
-    def sample(self, sample: "mi.Point2f", active: "mi.Bool" = True) -> "mi.Vector3f":
+    def sample(self, sample: Point2f, active: Bool = True) -> Vector3f:
         """A direction: a lobe by its share of the energy, then a direction in it."""
         index, reused = self.distribution.sample_reuse(sample.x, active)
         with dr.suspend_grad():

@@ -6,7 +6,7 @@ light and the points are constants, which takes one launch for all scenes and an
 import drjit as dr
 import mitsuba as mi
 
-from sira_mi.sg.lobes import unpack_raw
+from sira_mi.sg.lobes import interleave, unpack_raw
 from sira_mi.sg.shading import diffuse_irradiance
 from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
 
@@ -68,7 +68,7 @@ class _SumOfLights(dr.CustomOp):
             return (index + 1,)
 
         dr.while_loop((mi.UInt32(0),), lambda index: index < self.count, body, labels=("index",))
-        return dr.ravel(mi.ArrayXf([dr.block_sum(share, self.points) for share in shares]))
+        return interleave([dr.block_sum(share, self.points) for share in shares])
 
     def name(self):
         return "sum_of_lights"

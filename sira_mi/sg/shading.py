@@ -6,14 +6,15 @@ and its closed form with one cosine integral instead of a two-term cosine: the b
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from sira_mi.sg import brdf
+from sira_mi.sg.arrays import Color3f, Float, TensorXf, Vector3f
 from sira_mi.sg.integrals import cosine_integral, product
-from sira_mi.sg.lobes import lobe_count, unpack_lobe, unpack_raw
+from sira_mi.sg.lobes import interleave, lobe_count, unpack_lobe, unpack_raw
 from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
 
 # A view direction lower than this cosine is shaded as if at it: PhySG's warped sharpness is λ/(4 n·v).
@@ -22,16 +23,12 @@ _MINIMUM_VIEW_COSINE = 1e-3
 _POINTS_PER_LANE = 32
 
 
-def diffuse_irradiance(
-    normal: "mi.Vector3f", axis: "mi.Vector3f", sharpness: "mi.Float", amplitude: "mi.Color3f"
-) -> "mi.Color3f":
+def diffuse_irradiance(normal: Vector3f, axis: Vector3f, sharpness: Float, amplitude: Color3f) -> Color3f:
     """∫ G (ω·n)₊ dω of one light lobe: irradiance `[..., 3]`; times albedo/π it is diffuse radiance."""
     return amplitude * cosine_integral(dr.dot(normal, axis), sharpness)
 
 
-def specular_lobe(
-    normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float"
-) -> tuple["mi.Vector3f", "mi.Float", "mi.Float"]:
+def specular_lobe(normal: Vector3f, view: Vector3f, roughness: Float) -> tuple[Vector3f, Float, Float]:
     """PhySG's warped distribution as a lobe of light directions: mirror axis, sharpness λ/(4 n·v), 1/(πr⁴)."""
     cosine = dr.maximum(dr.dot(normal, view), _MINIMUM_VIEW_COSINE)
     sharpness = brdf.distribution_sharpness(roughness)
@@ -40,28 +37,28 @@ def specular_lobe(
 
 
 def specular_radiance(
-    normal: "mi.Vector3f",
-    view: "mi.Vector3f",
-    specular_albedo: "mi.Float",
-    roughness: "mi.Float",
-    axis: "mi.Vector3f",
-    sharpness: "mi.Float",
-    amplitude: "mi.Color3f",
-) -> "mi.Color3f":
+    normal: Vector3f,
+    view: Vector3f,
+    specular_albedo: Float,
+    roughness: Float,
+    axis: Vector3f,
+    sharpness: Float,
+    amplitude: Color3f,
+) -> Color3f:
     """∫ G f^s (ω·n)₊ dω of one light lobe `[..., 3]`, 0 where the view is below the surface."""
     white, grazing = specular_integrals(specular_lobes(normal, view, roughness), axis, sharpness)
     return amplitude * dr.lerp(grazing, white, specular_albedo)
 
 
 def specular_radiance_physg(
-    normal: "mi.Vector3f",
-    view: "mi.Vector3f",
-    specular_albedo: "mi.Float",
-    roughness: "mi.Float",
-    axis: "mi.Vector3f",
-    sharpness: "mi.Float",
-    amplitude: "mi.Color3f",
-) -> "mi.Color3f":
+    normal: Vector3f,
+    view: Vector3f,
+    specular_albedo: Float,
+    roughness: Float,
+    axis: Vector3f,
+    sharpness: Float,
+    amplitude: Color3f,
+) -> Color3f:
     """`specular_radiance` as in PhySG: one warped lobe, Fresnel and masking at the mirror direction."""
     cosine = dr.dot(normal, view)
     lobe_axis, lobe_sharpness, lobe_amplitude = specular_lobe(normal, view, roughness)
@@ -75,7 +72,7 @@ def specular_radiance_physg(
 class DiffusePoint(NamedTuple):
     """What the irradiance alone needs of a shading point."""
 
-    normal: "mi.Vector3f"
+    normal: Vector3f
 
 
 def _point(values):
@@ -106,8 +103,9 @@ def _sum_over_lobes(point, packed, count):
         parts = _integrate_lobe(point, *unpack_lobe(packed, index))
         return index + 1, *(total + part for total, part in zip(sums, parts, strict=True))
 
+    state: tuple[Any, ...] = (mi.UInt32(0), *(mi.Color3f(0.0) for _ in labels))
     return dr.while_loop(
-        state=(mi.UInt32(0), *(mi.Color3f(0.0) for _ in labels)),
+        state=state,
         cond=lambda index, *_: index < count,
         body=body,
         labels=("index", *labels),
@@ -167,8 +165,7 @@ def _lobe_gradient(point, packed, count, gradient):
     # In one launch; the block sum of what is not evaluated yet would run the loop for itself.
     dr.eval(axis, sharpness, amplitude)
     by_lobe = lane % chunks * count + lane // chunks
-    sums = [dr.block_sum(dr.gather(mi.Float, x, by_lobe), chunks) for x in (*axis, sharpness, *amplitude)]
-    return dr.ravel(mi.ArrayXf(sums))
+    return interleave([dr.block_sum(dr.gather(mi.Float, x, by_lobe), chunks) for x in (*axis, sharpness, *amplitude)])
 
 
 class _SumOverLobes(dr.CustomOp):
@@ -181,8 +178,9 @@ class _SumOverLobes(dr.CustomOp):
 
     def forward(self):
         point, packed, count = self.inputs
-        inputs = type(packed)(packed), *(type(value)(value) for value in point)
-        tangents = [self.grad_in("packed"), *self.grad_in("point")]
+        inputs = [type(value)(value) for value in (packed, *point)]
+        of_point: Any = self.grad_in("point")
+        tangents = [self.grad_in("packed"), *of_point]
         with dr.resume_grad():
             dr.enable_grad(inputs)
             for value, tangent in zip(inputs, tangents, strict=True):
@@ -213,18 +211,18 @@ def _sums(point, lobes):
     return dr.custom(_SumOverLobes, lobes.array, count, attached, *point)
 
 
-def irradiance(normal: "mi.Vector3f", lobes: "mi.TensorXf") -> "mi.Color3f":
+def irradiance(normal: Vector3f, lobes: TensorXf) -> Color3f:
     """The irradiance of `shade` alone, for surfaces without a specular part."""
     return _sums(DiffusePoint(normal), lobes)[0]
 
 
 def shade(
-    normal: "mi.Vector3f",
-    view: "mi.Vector3f",
-    specular_albedo: "mi.Float",
-    roughness: "mi.Float",
-    lobes: "mi.TensorXf",
-) -> tuple["mi.Color3f", "mi.Color3f"]:
+    normal: Vector3f,
+    view: Vector3f,
+    specular_albedo: Float,
+    roughness: Float,
+    lobes: TensorXf,
+) -> tuple[Color3f, Color3f]:
     """Irradiance and specular radiance under all lobes `[N_l, 7]`; diffuse radiance is albedo/π × irradiance.
 
     Unit vectors, `view` pointing away from the surface. Differentiable in every argument. Outside symbolic code the
@@ -235,16 +233,16 @@ def shade(
 
 
 def shade_tensor(
-    normal: "mi.TensorXf",
-    view: "mi.TensorXf",
-    specular_albedo: "mi.TensorXf | mi.Float",
-    roughness: "mi.Float",
-    lobes: "mi.TensorXf",
-) -> tuple["mi.TensorXf", "mi.TensorXf"]:
+    normal: TensorXf,
+    view: TensorXf,
+    specular_albedo: TensorXf,
+    roughness: Float,
+    lobes: TensorXf,
+) -> tuple[TensorXf, TensorXf]:
     """`shade` on tensors: normals and views `[3, P]`, specular albedo `[P]` → irradiance and specular `[3, P]`."""
     albedo = specular_albedo.array if isinstance(specular_albedo, mi.TensorXf) else specular_albedo
     result = shade(mi.Vector3f(normal), mi.Vector3f(view), albedo, roughness, lobes)
-    return tuple(mi.TensorXf(value) for value in result)
+    return mi.TensorXf(result[0]), mi.TensorXf(result[1])
 
 
 def shade_reference(normal, view, specular_albedo, roughness, lobes):

@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from sira_mi.sg import brdf, specular_table
+from sira_mi.sg.arrays import Float, Vector3f
 from sira_mi.sg.integrals import clamped_mean, mean_over_sharpness, product, sphere_integral
 
 # Range of the roughness in the tables; below it they scale with the width of the normal distribution.
@@ -43,31 +44,31 @@ _DARK = -1e4
 class LobeShape(NamedTuple):
     """What is tabulated of a shading point; see `specular_table.py`."""
 
-    white_energy: "mi.Float"
-    white_turn: "mi.Float"
-    white_sharpness: "mi.Float"
-    grazing_energy: "mi.Float"
-    grazing_turn: "mi.Float"
-    grazing_sharpness: "mi.Float"
-    across: "mi.Float"
-    half_point: "mi.Float"
+    white_energy: Float
+    white_turn: Float
+    white_sharpness: Float
+    grazing_energy: Float
+    grazing_turn: Float
+    grazing_sharpness: Float
+    across: Float
+    half_point: Float
 
 
 class SpecularLobes(NamedTuple):
     """What the integral against a light lobe needs of a shading point: for F = 1 (white) and for F = P (grazing) the
     round factor of the lobe, for both its sharpness κ across the plane of incidence and the half point τ."""
 
-    normal: "mi.Vector3f"
-    view: "mi.Vector3f"
-    roughness: "mi.Float"
-    across: "mi.Float"
-    half_point: "mi.Float"
-    white_axis: "mi.Vector3f"
-    white_sharpness: "mi.Float"
-    white_log_amplitude: "mi.Float"
-    grazing_axis: "mi.Vector3f"
-    grazing_sharpness: "mi.Float"
-    grazing_log_amplitude: "mi.Float"
+    normal: Vector3f
+    view: Vector3f
+    roughness: Float
+    across: Float
+    half_point: Float
+    white_axis: Vector3f
+    white_sharpness: Float
+    white_log_amplitude: Float
+    grazing_axis: Vector3f
+    grazing_sharpness: Float
+    grazing_log_amplitude: Float
 
 
 def _chebyshev(x, count):
@@ -77,7 +78,7 @@ def _chebyshev(x, count):
     return values
 
 
-def table_variables(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Float", "mi.Float"]:
+def table_variables(cosine: Float, roughness: Float) -> tuple[Float, Float]:
     """The variables of the tables, each from −1 to 1, at a view cosine and a roughness."""
     scale = _TABLE_GRAZING * dr.square(roughness)
     within = dr.clip(roughness, MINIMUM_ROUGHNESS, MAXIMUM_ROUGHNESS)
@@ -86,7 +87,7 @@ def table_variables(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Floa
     return grazing, (within - middle) * (1.0 / half_span)
 
 
-def tabulated_shape(cosine: "mi.Float", roughness: "mi.Float") -> LobeShape:
+def tabulated_shape(cosine: Float, roughness: Float) -> LobeShape:
     """The tables at a view cosine in (0, 1] and a roughness."""
     variables = table_variables(cosine, roughness)
     cosine_terms, roughness_terms = (
@@ -100,21 +101,19 @@ def tabulated_shape(cosine: "mi.Float", roughness: "mi.Float") -> LobeShape:
     return LobeShape(*values)
 
 
-def mean_half_cosine(cosine: "mi.Float", roughness: "mi.Float") -> "mi.Float":
+def mean_half_cosine(cosine: Float, roughness: Float) -> Float:
     """About the mean cosine of view and half vectors, which stays away from 0 at grazing views."""
     return dr.sqrt(dr.square(cosine) + _MEAN_GRAZING * dr.square(dr.square(roughness)))
 
 
-def log_energy(cosine: "mi.Float", roughness: "mi.Float") -> tuple["mi.Float", "mi.Float"]:
+def log_energy(cosine: Float, roughness: Float) -> tuple[Float, Float]:
     """Log of about ∫ f^s (ω·n)₊ dω over the hemisphere for F = 1 and F = P, the limit for small roughness."""
     half = mean_half_cosine(cosine, roughness)
     white = 2.0 * dr.log(half * brdf.masking(half, roughness))
     return white, white + brdf.log_fresnel_weight(half)
 
 
-def shaped_lobes(
-    normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float", shape: LobeShape, cosine: "mi.Float"
-) -> SpecularLobes:
+def shaped_lobes(normal: Vector3f, view: Vector3f, roughness: Float, shape: LobeShape, cosine: Float) -> SpecularLobes:
     """The lobes of a given shape, for a view of that `cosine` above the surface."""
     sharpness = 0.25 * brdf.distribution_sharpness(roughness)
     mirror = 2.0 * cosine * normal - view
@@ -135,7 +134,7 @@ def shaped_lobes(
     return SpecularLobes(normal, view, mi.Float(roughness), across, sharpness * dr.exp(shape.half_point), *lobes)
 
 
-def specular_lobes(normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Float") -> SpecularLobes:
+def specular_lobes(normal: Vector3f, view: Vector3f, roughness: Float) -> SpecularLobes:
     """The two lobes at a shading point with unit `normal` and `view`; dark where the view is below the surface."""
     cosine = dr.dot(normal, view)
     clipped = dr.clip(cosine, _MINIMUM_VIEW_COSINE, 1.0)
@@ -148,9 +147,7 @@ def specular_lobes(normal: "mi.Vector3f", view: "mi.Vector3f", roughness: "mi.Fl
     return lobes._replace(white_log_amplitude=white, grazing_log_amplitude=grazing)
 
 
-def specular_integrals(
-    lobes: SpecularLobes, axis: "mi.Vector3f", sharpness: "mi.Float"
-) -> tuple["mi.Float", "mi.Float"]:
+def specular_integrals(lobes: SpecularLobes, axis: Vector3f, sharpness: Float) -> tuple[Float, Float]:
     """∫ exp(λ(ω·ξ − 1)) f^s (ω·n)₊ dω of one light lobe, for F = 1 and for F = P."""
     white = _integral(lobes, "white", axis, sharpness)
     return white, _integral(lobes, "grazing", axis, sharpness)

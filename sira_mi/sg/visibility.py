@@ -16,6 +16,7 @@ Which directions are unoccluded depends on the geometry alone: they are traced o
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,8 +26,9 @@ from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.columns import in_three, to_columns
 from sira_mi.fields.directions import GOLDEN_ANGLE, fibonacci_directions
 from sira_mi.sg import brdf
+from sira_mi.sg.arrays import Bool, Float, TensorXf
 from sira_mi.sg.integrals import sphere_integral
-from sira_mi.sg.lobes import lobe_count, unpack_lobe
+from sira_mi.sg.lobes import lobe_count, lobe_integral, unpack_lobe
 
 # Directions in which `sira_sg` traces shadow rays, unless asked for others.
 DEFAULT_DIRECTIONS = 64
@@ -54,10 +56,10 @@ class Directions:
 class Visibility:
     """How much of a light reaches some points, and what the surfaces that block the rest reflect onto them."""
 
-    diffuse: "mi.TensorXf"  # [3, N] unoccluded share of the irradiance
-    specular: "mi.TensorXf | None"  # [3, N] unoccluded share of the specular radiance; None without a specular term
-    bounce_diffuse: "mi.TensorXf"  # [3, N] irradiance from occluders, per unit of their albedo
-    bounce_specular: "mi.TensorXf | None"  # [3, N] specular radiance of their light, per unit of their albedo
+    diffuse: TensorXf  # [3, N] unoccluded share of the irradiance
+    specular: TensorXf | None  # [3, N] unoccluded share of the specular radiance; None without a specular term
+    bounce_diffuse: TensorXf  # [3, N] irradiance from occluders, per unit of their albedo
+    bounce_specular: TensorXf | None  # [3, N] specular radiance of their light, per unit of their albedo
 
 
 def even_directions(count: int) -> Directions:
@@ -90,7 +92,7 @@ def _lobe_frames(lobes):
 def _spread_over_lobes(lobes, count):
     """`count` directions [count, 3], spirals through equal shares of the lobes' energy; and the shares [N_l]."""
     sharpness = np.maximum(lobes[:, 3], 1e-6)
-    energy = (lobes[:, 4:] @ LUMINANCE) * -np.expm1(-2 * sharpness) / sharpness
+    energy = (lobes[:, 4:] @ LUMINANCE) * lobe_integral(sharpness)
     energy = np.full(len(lobes), 1 / len(lobes)) if energy.sum() <= 0 else energy / energy.sum()
     place = (np.arange(count) + 0.5) / count
     ends = np.cumsum(energy)
@@ -106,13 +108,12 @@ def _spread_over_lobes(lobes, count):
 def _mixture_density(lobes, energy, direction):
     """Density per steradian [K] of `direction` [K, 3] in the mixture of lobes with the shares `energy`."""
     sharpness = np.maximum(lobes[:, 3], 1e-6)
-    peak = sharpness / (-2 * np.pi * np.expm1(-2 * sharpness))
     cosine = direction @ _lobe_frames(lobes)[0].T
-    return np.exp(sharpness * np.minimum(cosine - 1, 0)) @ (energy * peak)
+    return np.exp(sharpness * np.minimum(cosine - 1, 0)) @ (energy / lobe_integral(sharpness))
 
 
 def trace_unoccluded(
-    scene: "mi.Scene", point: np.ndarray, normal: np.ndarray, directions: np.ndarray, offset: float
+    scene: mi.Scene, point: np.ndarray, normal: np.ndarray, directions: np.ndarray, offset: float
 ) -> np.ndarray:
     """Whether nothing of the scene lies in each of `directions` [K, 3] from points [3, N] with unit normals [3, N]:
     bool [K, N]. Directions below the surface count as unoccluded. Rays start `offset` scene units above the surface and
@@ -121,6 +122,7 @@ def trace_unoccluded(
     start = [mi.Vector3f(np.ascontiguousarray(v, np.float32)) for v in (point + offset * normal, normal)]
     step = max(1, _LAUNCH // max(count, 1))
     parts = []
+    coherent: Any = False  # the stubs want an array
     with dr.suspend_grad():
         for first in range(0, len(directions), step):
             rows = min(step, len(directions) - first)
@@ -129,12 +131,12 @@ def trace_unoccluded(
             direction = mi.Vector3f(*(dr.gather(mi.Float, axis, 3 * row + k) for k in range(3)))
             origin, up = (dr.gather(mi.Vector3f, v, column) for v in start)
             ray = mi.Ray3f(mi.Point3f(origin + offset * direction), direction)
-            above = dr.dot(up, direction) > 0.0
-            parts.append((~(above & scene.ray_test(ray, False, above))).numpy().reshape(rows, count))
+            above: Bool = dr.dot(up, direction) > 0.0
+            parts.append((~(above & scene.ray_test(ray, coherent, above))).numpy().reshape(rows, count))
     return np.concatenate(parts)
 
 
-def light_radiance(lobes: "mi.TensorXf", directions: Directions) -> "mi.TensorXf":
+def light_radiance(lobes: TensorXf, directions: Directions) -> TensorXf:
     """Radiance [3, K] of `lobes` [N_l, 7] in the directions, lobes widened to what the directions resolve; multiplied
     by the steradians of each. Differentiable, without atomics."""
     count = lobe_count(lobes)
@@ -144,19 +146,20 @@ def light_radiance(lobes: "mi.TensorXf", directions: Directions) -> "mi.TensorXf
         amplitude = amplitude * (sphere_integral(sharpness) / sphere_integral(wide))
         sharpness = wide
     ones = dr.full(mi.TensorXf, 1.0, (1, len(directions.axis)))
-    cosine = mi.TensorXf(dr.ravel(axis), (count, 3)) @ _constant(directions.axis.T)
+    axes: Float = dr.ravel(axis)
+    cosine = mi.TensorXf(axes, (count, 3)) @ _constant(directions.axis.T)
     exponent = (mi.TensorXf(sharpness, (count, 1)) @ ones) * dr.minimum(cosine - 1.0, 0.0)
     return (to_columns(amplitude) @ dr.exp(exponent)) * _in_rows(directions.weight, 3)
 
 
 def light_visibility(
-    normals: "mi.TensorXf",
-    views: "mi.TensorXf",
-    specular_albedo: "mi.TensorXf | None",
-    roughness: "mi.Float",
-    lobes: "mi.TensorXf",
+    normals: TensorXf,
+    views: TensorXf,
+    specular_albedo: TensorXf | None,
+    roughness: Float,
+    lobes: TensorXf,
     directions: Directions,
-    unoccluded: "mi.TensorXf",
+    unoccluded: TensorXf,
 ) -> Visibility:
     """Visibility of the light `lobes` [N_l, 7] at points with unit normals and unit views (from the camera to the
     point) [3, N] and specular albedo [1, N], None without a specular term; `unoccluded` [K, N], 0 or 1, says in which

@@ -7,6 +7,8 @@ f^s (n·ω)₊ = 1/(4πr⁴k), k = (r + 1)²/8, of `sg.brdf` with F <= 1. NumPy,
 
 import numpy as np
 
+from sira_mi.sg.lobes import lobe_integral
+
 
 def facing_irradiance(sharpness: np.ndarray) -> np.ndarray:
     """∫ exp(λ(ω·n − 1)) (ω·n)₊ dω [N_l], steradians: the irradiance of a unit lobe on a surface that faces it."""
@@ -23,7 +25,7 @@ def radiance_bounds(
     `diffuse_albedo` is the largest of the surface, `reflectance` the largest share of a light from everywhere that its
     specular term sends anywhere."""
     sharpness, amplitude = lobes[:, 3].astype(np.float64), lobes[:, 4:].max(axis=1).astype(np.float64)
-    energy = -2 * np.pi * np.expm1(-2 * sharpness) / np.maximum(sharpness, 1e-12)
+    energy = lobe_integral(np.maximum(sharpness, 1e-12))
     peak = 2 / (np.pi * roughness**4 * (roughness + 1) ** 2)
     specular = np.minimum(reflectance, peak * energy)
     return amplitude * (diffuse_albedo / np.pi * facing_irradiance(sharpness) + k_s * specular)

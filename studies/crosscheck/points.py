@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.columns import evaluate_in_chunks, normalise, to_columns
+from sira_mi.fields.columns import evaluate_in_chunks, gather_columns, normalise
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import on_ray
 from sira_mi.plugins.neural_sdf import trace_head
@@ -70,7 +70,7 @@ def field_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: i
     t, hit = trace_head(scene, head, ray, mi.Bool(True))
     index = dr.compress(hit)
     local = head.to_local @ ray
-    origin, direction, parameter = (to_columns(dr.gather(type(v), v, index)) for v in (local.o, local.d, t))
+    origin, direction, parameter = (gather_columns(v, index) for v in (local.o, local.d, t))
     x = on_ray(origin, direction, parameter).numpy()
     field, bsdf = head.field(), head.bsdf()
 
@@ -99,7 +99,7 @@ def mesh_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: in
     inverse = rotation_of(head.to_world).T
 
     def at(vector) -> np.ndarray:
-        return to_columns(dr.gather(type(vector), vector, index)).numpy()
+        return gather_columns(vector, index).numpy()
 
     x = at(head.to_local @ si.p)
     field, bsdf = head.field(), head.bsdf()

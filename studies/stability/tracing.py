@@ -168,17 +168,14 @@ def count_wrong_hits(scene, origin, direction, step: float) -> int:
 
 def _are_hit_gradients_finite(head, origin, direction, t) -> bool:
     """Whether the derivatives of the hits by the reference network and the latent are finite."""
-    keys = ("reference", "z_sdf")
-    before = {key: getattr(head, key) for key in keys}
+    before, keys = dict(head.parameters), ("reference", "z_sdf")
     for key in keys:
-        value = mi.Float(before[key])
-        dr.enable_grad(value)
-        setattr(head, key, value)
+        head.parameters[key] = mi.Float(before[key])
+        dr.enable_grad(head.parameters[key])
     columns = [mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (origin, direction, t[None])]
     dr.backward(dr.sum(tracing.differentiable_hit(head.field(), *columns), axis=None))
-    finite = all(count_non_finite(dr.grad(getattr(head, key)).numpy()) == 0 for key in keys)
-    for key in keys:
-        setattr(head, key, before[key])
+    finite = all(count_non_finite(dr.grad(head.parameters[key]).numpy()) == 0 for key in keys)
+    head.parameters |= before
     return finite
 
 
