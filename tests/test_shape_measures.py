@@ -300,7 +300,7 @@ def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_pa
 
     fits = json.loads((runs / "evidence" / "fits.json").read_text())["result"]
     face = np.mean([row["fitted"]["distance"]["face"]["mean"] for row in fits["scans"]])
-    assert f"| face, mm | ≤ 1 | {face:.2f} |" in text
+    assert f"| face, mm | ≤1 | {face:.2f} |" in text
     assert [row["name"] for row in fits["scans"]] == ["scene_3.npz", "scene_4.npz"]
 
     def again(*_, **__):

@@ -15,10 +15,9 @@ AT_MOST, AT_LEAST = "≤", "≥"
 
 PAGE = """# Results of the single-image fit
 
-{portraits} portraits of heads that no training has seen ([benchmark](benchmark.md)), fitted at `{quality}` quality. A
-fit gets the photo and its EXIF focal length; it estimates camera, mask and landmarks itself. Measured at revision
-`{revision}` on {date}; more columns and every portrait are in [data/portraits.json](data/portraits.json), what was
-tried is in the [notebook](notebook/portraits.md).
+{portraits} portraits of unseen heads ([benchmark](benchmark.md)), fitted at `{quality}` quality from the photo and its
+EXIF focal length alone. Measured at revision `{revision}` on {date}. Every portrait and score:
+[data/portraits.json](data/portraits.json). What was tried: [notebook](notebook/portraits.md).
 
     python -m studies.portraits build --collection COLLECTION --out BENCHMARK
     python -m studies.portraits fit --benchmark BENCHMARK --runs RUNS
@@ -31,11 +30,11 @@ tried is in the [notebook](notebook/portraits.md).
 
 {geometry}
 
-Means over portraits, mm. `face`: skin and eyes within 95 mm of the nose tip, both directions, after alignment by six
-landmarks and ICP with scale (H3DS). `no ICP`: the same in the photo's camera frame, with one scale about the camera's
-centre. `hidden half`: what the photo does not show, hair included. `IoU` leaves out the body below the model's floor,
-30 cm under the ears. {geometry_method} is the geometry of the fit; {shipped} continues from it, and its shading stage
-moves the surface again where the quality has one.
+Mean distances, mm, both directions. `face`: skin and eyes within 95 mm of the nose tip, after alignment by six
+landmarks and ICP with scale (H3DS). `no ICP`: in the photo's camera frame, one scale about the camera's centre. `head`:
+above the shoulders, with hair. `hidden half`: what the photo does not show. `IoU` ignores the body 30 cm below the ears
+and lower. {geometry_method} is the fit's geometry; {shipped} continues from it, and its shading stage moves the surface
+where the quality has one.
 
 ## Appearance
 
@@ -43,24 +42,22 @@ moves the surface again where the quality has one.
 
 PSNR and SSIM are of sRGB values inside the mask. `eq. 8` is the final render without the
 [refinement of the light](architecture.md#albedo-or-light): what albedo, light and shape explain by themselves. Specular
-albedo is the reflectance at normal incidence over 0.08. The last two rows are the extremes over portraits.
+albedo is the reflectance at normal incidence over 0.08. Last rows: extremes over portraits.
 
 ## Ablations
 
 {ablations}
 
-All at `{ablation_quality}` quality; the b methods continue from {geometry_method} or from one another. `scaled` is
-after one least-squares factor per channel. `leakage` is the correlation of the log albedo's error on skin with the log
-of the light; 0 is none.
+All at `{ablation_quality}` quality, continuing from {geometry_method}. `scaled`: after one least-squares factor per
+channel. `leakage`: correlation of the log albedo's error on skin with the log of the light; 0 is none.
 
 ## Limits
 
-- The heads are synthetic, neutral, with closed mouths. Nothing here measures expressions, glasses, hats or beards.
-- Region levels of the specular albedo are those that the prior was trained with: its scores tell how well regions are
-  found, not more.
-- The refinement of the light holds in the photo's own light. Under another light, `eq. 8` is what remains.
-- Differences below 0.05 mm on the face are chance at this number of portraits ([notebook](notebook/portraits.md)).
-- Times are wall-clock times of whole processes on two cores without a GPU.
+- Heads are synthetic, neutral, with closed mouths: no expressions, glasses, hats or beards.
+- Regions have the specular levels of the training data, so specular scores measure how well regions are found.
+- The refinement of the light holds in the photo's own light only; relit, `eq. 8` remains.
+- Differences of 0.05 mm on the face are chance at about this number of heads.
+- Times are wall-clock, whole processes, two cores, no GPU.
 {failed}
 ## Pictures
 
@@ -230,7 +227,7 @@ def _marks(figures: dict) -> str:
     for mark in MARKS:
         value = mark.value(figures)
         verdict = "–" if value is None else "met" if mark.is_met(value) else "**missed**"
-        lines.append([mark.title, f"{mark.sign} {mark.limit:g}", number(value, mark.digits), verdict])
+        lines.append([mark.title, f"{mark.sign}{mark.limit:g}", number(value, mark.digits), verdict])
     return table(("", "wanted", "measured", ""), lines)
 
 

@@ -146,13 +146,11 @@ def fit_appearance_latents(
     for step in range(fit.steps):
         optimizer.set_learning_rate(dict.fromkeys(af_sm.LATENTS, fit.rate * cosine_fall(step / fit.steps, 0.05)))
         batch = af_sm.draw_batch(frozen, settings, np.random.default_rng([seed, 6, step]))
-        take_step(
-            optimizer,
-            lambda latents, batch=batch: af_sm.appearance_losses(
-                avatar.architecture, settings, networks | latents, batch
-            ),
-            lambda terms: af_sm.weighted_sum(terms, settings),
-        )
+
+        def losses(latents: dict, batch: af_sm.AppearanceBatch = batch) -> dict:
+            return af_sm.appearance_losses(avatar.architecture, settings, networks | latents, batch)
+
+        take_step(optimizer, losses, lambda terms: af_sm.weighted_sum(terms, settings))
     return parameter_values(optimizer)
 
 

@@ -14,13 +14,11 @@ FACE_LIMIT, HEAD_LIMIT, FACE_SHARE, GRADIENT_SHARE = 1.0, 2.0, 0.5, 0.95
 
 PAGE = """# How good the priors are
 
-A prior is measured on heads of the collection's test split, which no training has seen. Measured at revision
-`{revision}` on {date}; more columns are in [data/priors.json](data/priors.json), what was tried is in the
-[notebook](notebook/priors.md). What each loss term and network size is for: [short trainings](prior_trainings.md).
+Measured on the collection's test split, which no training has seen, at revision `{revision}` on {date}. All figures:
+[data/priors.json](data/priors.json). Loss terms and network sizes: [short trainings](prior_trainings.md). What was
+tried: [notebook](notebook/priors.md).
 
     python -m studies.priors measure --collection COLLECTION --runs RUNS
-
-## Data and training
 
 {data}
 
@@ -96,14 +94,14 @@ HEADS = """Latents drawn from N(0, σ²) of the prior; |∇f| at surface points.
 1σ, 2σ, and the mean head with the first {count} principal directions of the training latents at −2σ and +2σ, which hold
 {share} of the variance.
 
-Distance of each landmark from its mean over heads (RMS, mm), before and after the deformation into reference space;
-`scale` tells how much of that is shrinking.
+RMS distance of landmarks from their mean over heads, mm, before and after the deformation into reference space; `scale`
+is the ratio of sizes, after over before.
 
 {landmarks}"""
 
 APPEARANCE = """Latents of albedo, specular albedo and light are fitted to the training views of {scans} scans by the
-AF-SM's own losses; true albedo is never used. Scores are of the two held-out views, at points or as images ({imaged}
-scans). `one colour` is the mean of the training heads, for re-rendering of the view.
+AF-SM's losses, without true albedo. Scores are of two held-out views, at points or as images ({imaged} scans).
+`one colour`: mean of the training heads, for re-rendering of the view.
 
 {table}
 
@@ -160,25 +158,26 @@ def render_pages(figures: dict) -> dict[str, str]:
 
 
 def _data(figures: dict) -> str:
-    splits = [
-        [split, str(data["heads"]), ", ".join(f"{count} {source}" for source, count in data["sources"].items())]
-        for split, data in figures["collection"].items()
-    ]
-    trainings = [
-        [name, number(data["steps"], 0), number(data["minutes"], 0)] for name, data in figures["training"].items()
-    ]
-    return table(("split", "heads", "sources"), splits) + "\n\n" + table(("model", "steps", "minutes"), trainings)
+    heads = []
+    for split, data in figures["collection"].items():
+        sources = ", ".join(f"{count} {source}" for source, count in data["sources"].items())
+        heads.append(f"{split}: {data['heads']} heads ({sources})")
+    trainings = (
+        f"{name}: {number(data['steps'], 0)} steps, {number(data['minutes'], 0)} minutes"
+        for name, data in figures["training"].items()
+    )
+    return f"{'; '.join(heads)}. {'; '.join(trainings)}."
 
 
 def _marks(figures: dict) -> str:
     face, head = (figures["shape"]["scan_to_surface"][region] for region in ("face", "head without hair"))
     share = face["fitted"]["mean"] / face["mean_head"]["mean"]
     lines = [
-        _bound("face, mm", f"≤ {FACE_LIMIT:g}", number(face["fitted"]["mean"]), face["fitted"]["mean"] <= FACE_LIMIT),
-        _bound("face over the mean head's", f"< {percent(FACE_SHARE)}", percent(share), share < FACE_SHARE),
+        _bound("face, mm", f"≤{FACE_LIMIT:g}", number(face["fitted"]["mean"]), face["fitted"]["mean"] <= FACE_LIMIT),
+        _bound("face over the mean head's", f"<{percent(FACE_SHARE)}", percent(share), share < FACE_SHARE),
         _bound(
             "head without hair, mm",
-            f"≤ {HEAD_LIMIT:g}",
+            f"≤{HEAD_LIMIT:g}",
             number(head["fitted"]["mean"]),
             head["fitted"]["mean"] <= HEAD_LIMIT,
         ),
@@ -186,7 +185,7 @@ def _marks(figures: dict) -> str:
     for sigma, row in figures["random_heads"].items():
         title = f"|∇f| in 0.9–1.1 on random heads, {sigma}σ"
         met = row["gradient"] >= GRADIENT_SHARE
-        lines.append(_bound(title, f"≥ {percent(GRADIENT_SHARE)}", percent(row["gradient"]), met))
+        lines.append(_bound(title, f"≥{percent(GRADIENT_SHARE)}", percent(row["gradient"]), met))
     return table(("", "wanted", "measured", ""), lines)
 
 
@@ -226,14 +225,14 @@ def _groups(figures: dict) -> str:
         [
             f"{row['trait']} {row['group']}",
             str(row["scans"]),
-            *(number(row[name]) for name in ("face", "mean_head_face", "head")),
-            *(number(row[name], 1) for name in ("render_psnr", "face_albedo_psnr")),
+            *(number(row[name]) for name in ("face", "head")),
+            number(row["face_albedo_psnr"], 1),
             number(row["face_albedo_bias"]),
         ]
         for row in figures["groups"]
         if row["group"] != "unknown"
     ]
-    head = ("group", "scans", "face, mm", "mean head", "head, mm", "re-rendering, dB", "face albedo, dB", "bias, stops")
+    head = ("group", "scans", "face, mm", "head, mm", "face albedo, dB", "bias, stops")
     return (
         "Scan → surface, head without hair. A positive bias: the albedo is too light. Heads of unknown traits are left "
         "out.\n\n" + table(head, lines)
