@@ -9,6 +9,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -118,7 +119,8 @@ def _read_skin(stored: dict | None) -> SkinPrior | None:
     """Raises TypeError or ValueError for anything but the values of a `SkinPrior`."""
     if stored is None:
         return None
-    return SkinPrior(**{name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()})
+    triples: dict[str, Any] = {name: tuple(value) for name, value in stored.items() if isinstance(value, list)}
+    return SkinPrior(**{**stored, **triples})
 
 
 def load_prior(path: str | Path | None = None) -> Avatar:
@@ -132,7 +134,7 @@ def load_prior(path: str | Path | None = None) -> Avatar:
 def _check(avatar: Avatar) -> None:
     """Raises ValueError unless every tensor is there, of its due size and type, and finite."""
     architecture, tensors = avatar.architecture, avatar.tensors
-    due = {name: (network.parameters,) for name, network in architecture.networks.items()}
+    due: dict[str, tuple[int, ...]] = {name: (network.parameters,) for name, network in architecture.networks.items()}
     due |= {name: (size,) for name, size in architecture.latents.items()}
     due |= {"lobes": (*tensors["lobes"].shape[:1], 7), "landmarks": (LANDMARKS, 3)}
     if not 0 < tensors["lobes"].size <= 7 * _MAXIMUM_LOBES:

@@ -60,7 +60,7 @@ class LandmarkModel:
         """Tensor [3, L] of tensor [3, L]."""
         if not self.linear:
             return placed
-        row = dr.reshape(placed, (1, 3 * placed.shape[1]))
+        row: mi.TensorXf = dr.reshape(placed, (1, 3 * placed.shape[1]))
         w = (row - self.placed) @ self.across
         return dr.reshape(self.mean + w @ self.offsets, placed.shape)
 

@@ -59,8 +59,8 @@ class SkinPrior:
         possible. `albedo` [3, S·L] at skin landmarks, `weight` [1, S·L] their shares, all 0 in scenes that do not
         count."""
         scenes = expected.shape[1]
-        mean = dr.sum(dr.reshape(albedo * in_three(weight), (3, scenes, -1)), axis=2)
-        known = dr.sum(dr.reshape(weight, (1, scenes, -1)), axis=2)
+        mean: mi.TensorXf = dr.sum(dr.reshape(albedo * in_three(weight), (3, scenes, -1)), axis=2)
+        known: mi.TensorXf = dr.sum(dr.reshape(weight, (1, scenes, -1)), axis=2)
         centre = mi.TensorXf(np.ascontiguousarray(expected, dtype=np.float32))
         deviation = dr.log(mean + in_three(1.0 - known) * dr.exp(centre)) - centre
         along = mi.TensorXf(self._unit_axis()[None, :].astype(np.float32)) @ deviation

@@ -13,6 +13,7 @@ The hidden activation is a softplus with β = 100 (IDR, Yariv et al. 2020).
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -77,7 +78,7 @@ def _sum_columns(gradient, columns: int):
     """The adjoint of `_add_bias` in its bias: an axis sum [W, S]. The one of Dr.Jit's broadcast is an atomic scatter,
     whose result varies from run to run."""
     rows = gradient.shape[0]
-    total = dr.sum(dr.reshape(gradient, (rows, columns, -1)), axis=2)
+    total: mi.TensorXf = dr.sum(dr.reshape(gradient, (rows, columns, -1)), axis=2)
     return type(gradient)(total.array, (rows, columns))
 
 
@@ -155,7 +156,8 @@ class _HiddenLayer(dr.CustomOp):
         return result
 
     def forward(self):
-        weight, h, tangents = self.grad_in("weight"), self.grad_in("h"), self.grad_in("tangents")
+        gradients: list[Any] = [self.grad_in(name) for name in ("weight", "h", "tangents")]
+        weight, h, tangents = gradients
         slope = _softplus_slope(self.a)
         bend = SOFTPLUS_SHARPNESS * slope * (1.0 - slope)
         a = _add_bias(weight @ self.h + self.weight @ h, self.grad_in("bias"))
@@ -165,7 +167,8 @@ class _HiddenLayer(dr.CustomOp):
         )
 
     def backward(self):
-        h, tangents = self.grad_out()
+        gradient: Any = self.grad_out()
+        h, tangents = gradient
         slope = _softplus_slope(self.a)
         bend = SOFTPLUS_SHARPNESS * slope * (1.0 - slope)
         a = slope * h
@@ -173,7 +176,7 @@ class _HiddenLayer(dr.CustomOp):
             a += bend * t * m
         moved = [slope * t for t in tangents]
         dr.eval(a, moved)
-        weight = dr.matmul(a, self.h, Bt=True)
+        weight: Any = dr.matmul(a, self.h, Bt=True)
         for u, t in zip(moved, self.tangents, strict=True):
             weight += dr.matmul(u, t, Bt=True)
         self.set_grad_in("weight", weight)

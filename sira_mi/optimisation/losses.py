@@ -4,6 +4,7 @@ from functools import reduce
 from operator import add
 
 import drjit as dr
+import mitsuba as mi
 
 from sira_mi.fields.columns import in_three
 
@@ -42,7 +43,7 @@ def distance_loss(distance, target, softening: float = 0.1):
 
 def deformation_loss(delta, scenes: int):
     """L_Def, eq. 5, averaged over scenes: δ [3, S·n], the points of one scene consecutive."""
-    per_scene = dr.sum(dr.reshape(delta, (3, scenes, -1)), axis=2)
+    per_scene: mi.TensorXf = dr.sum(dr.reshape(delta, (3, scenes, -1)), axis=2)
     n = delta.shape[1] // scenes
     return mean(_norm(delta)) + mean(_norm(per_scene)) / n
 
@@ -50,7 +51,7 @@ def deformation_loss(delta, scenes: int):
 def landmark_loss(x_ref, scenes: int):
     """L_Lm: mean over landmarks of the squared distances between the scenes' landmarks in reference space [3, S·L],
     the landmarks of one scene consecutive. The mean over pairs is twice the variance over scenes."""
-    x = dr.reshape(x_ref, (3, scenes, -1))
+    x: mi.TensorXf = dr.reshape(x_ref, (3, scenes, -1))
     square = dr.sum(x * x, axis=1) / scenes
     centre = dr.sum(x, axis=1) / scenes
     return 2.0 * mean(dr.sum(square - centre * centre, axis=0))
@@ -70,7 +71,7 @@ def smoothness_loss(values, moved):
 def white_light_loss(amplitude):
     """Mean squared log-chroma of the amplitudes [N_l, 3] or [N_l, 3, S] of a light's lobes: 0 for grey light."""
     logarithm = dr.log(amplitude)
-    grey = dr.reshape(dr.mean(logarithm, axis=1), (logarithm.shape[0], 1, *logarithm.shape[2:]))
+    grey: mi.TensorXf = dr.reshape(dr.mean(logarithm, axis=1), (logarithm.shape[0], 1, *logarithm.shape[2:]))
     chroma = logarithm - in_three(grey, axis=1)
     return mean(chroma * chroma)
 

@@ -149,11 +149,11 @@ def _resume(checkpoint: Path, optimizer, description: dict[str, str]) -> tuple[i
 def _differences(stored: str, wanted: str) -> str:
     """What differs between two JSON objects, in words; empty when nothing does."""
     try:
-        stored, wanted = json.loads(stored), json.loads(wanted)
-        names = sorted(k for k in {*stored, *wanted} if stored.get(k) != wanted.get(k))
+        there, now = json.loads(stored), json.loads(wanted)
+        names = sorted(k for k in {*there, *now} if there.get(k) != now.get(k))
     except (ValueError, TypeError, AttributeError):
         return "unreadable"
-    return ", ".join(f"{k}: {stored.get(k)} there, {wanted.get(k)} now" for k in names)
+    return ", ".join(f"{k}: {there.get(k)} there, {now.get(k)} now" for k in names)
 
 
 def _shorten(log: Path, step: int) -> None:

@@ -166,12 +166,12 @@ class AppearancePicture:
         """Writes one row a scene: albedo, specular albedo (eight times as bright), under its own light, under that of
         the next scene."""
         column = {name: parameters[name][:, self.chosen] for name in ("z_a", "z_s", "z_l")}
-        network = self.architecture.networks
-        lobes = illumination(_unpack(network, parameters, "illumination"), mi.TensorXf(column["z_l"]))
+        networks = self.architecture.networks
+        lobes = illumination(layers(networks["illumination"], parameters["illumination"]), mi.TensorXf(column["z_l"]))
         rows = []
         for k, (points, frozen) in enumerate(zip(self.points, self.frozen, strict=True)):
-            diffuse = _unpack(network, parameters, "diffuse_albedo", column["z_a"][:, k])
-            specular = _unpack(network, parameters, "specular_albedo", column["z_s"][:, k])
+            diffuse = layers(networks["diffuse_albedo"], parameters["diffuse_albedo"], column["z_a"][:, k])
+            specular = layers(networks["specular_albedo"], parameters["specular_albedo"], column["z_s"][:, k])
             lights = [lobes[:, :, k], lobes[:, :, (k + 1) % len(self.points)]]
             away = -yaw_rotation(YAW)[2].astype(np.float32)
 
@@ -187,8 +187,3 @@ class AppearancePicture:
             shine = np.repeat(8 * shine, 3, axis=0)
             rows.append([splat(points, frozen[0].T, np.sqrt(np.clip(v, 0, 1)).T) for v in (albedo, shine, *lit)])
         write_png(path, sheet(rows))
-
-
-def _unpack(networks, parameters, name: str, latent: np.ndarray | None = None) -> list[tuple]:
-    latent = None if latent is None else mi.TensorXf(np.ascontiguousarray(latent[:, None]))
-    return layers(networks[name], mi.Float(parameters[name]), latent)

@@ -71,8 +71,8 @@ def assemble_prior(
     rng = np.random.default_rng([seed, 4])
     refinement = architecture.networks["albedo_refinement"]
     tensors["albedo_refinement"] = initial_parameters(refinement, rng, output_scale=0.0)
-    network = layers(architecture.networks["illumination"], mi.Float(tensors["illumination"]))
-    tensors["lobes"] = illumination(network, mi.TensorXf(tensors["z_l"][:, None])).numpy()[:, :, 0]
+    light = layers(architecture.networks["illumination"], tensors["illumination"])
+    tensors["lobes"] = illumination(light, mi.TensorXf(tensors["z_l"][:, None])).numpy()[:, :, 0]
     with np.errstate(invalid="ignore"):
         counts = np.isfinite(landmarks[:, :, :1]).sum(axis=0)
         mean = np.nansum(landmarks, axis=0) / np.maximum(counts, 1)
