@@ -114,6 +114,7 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     assert not any(out.iterdir())
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_one_line_and_code_2(tmp_path):
     command = [sys.executable, "-m", "sira_mi.crosscheck", str(tmp_path / "nobody"), "--out", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60)

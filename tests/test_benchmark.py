@@ -199,6 +199,7 @@ def test_shadow_of_an_occluder_under_a_hard_light():
         assert image[umbra].mean() < 0.25 * image[lit].mean()
 
 
+@pytest.mark.slow
 def test_photo_agrees_with_the_renderer_of_training_scenes(sphere):
     """With one roughness for all regions, `render_views`, which shares no sampling with it, gives the same photo; at
     strength 1 its material is the same `principled`."""

@@ -189,6 +189,7 @@ def test_damaged_hair_is_refused(hair_folder, tmp_path, damage):
         hair.read_hair(tmp_path, "cap")
 
 
+@pytest.mark.slow
 def test_skin_stays_within_the_measured_range():
     """Albedo of skin lies between darkest and lightest measured skin, and redder than blue."""
     for seed in range(6):
@@ -288,6 +289,7 @@ def test_albedo_images_are_the_albedo_of_the_points(arrays):
         assert arrays["albedo_images"][row][empty].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_scenes_repeat_bit_for_bit(arrays, hair_folder):
     seed = json.loads(str(arrays["info"]))["seed"]
     again = scene.make_scene(MakeHumanSource(1, hair_folder).subject(0, seed), seed, [], SMALL)
@@ -295,6 +297,7 @@ def test_scenes_repeat_bit_for_bit(arrays, hair_folder):
         assert np.array_equal(arrays[name], again[name]), name
 
 
+@pytest.mark.slow
 def test_pixels_do_not_depend_on_the_order_of_threads(variant):
     """Sums of samples run in a fixed order: float32 images are equal to the last bit, and coverage is what the mask of
     a sphere must be."""

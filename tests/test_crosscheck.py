@@ -151,6 +151,7 @@ def test_parts_lead_from_every_form_to_the_reference():
         np.testing.assert_allclose(getattr(pictures, start) + total, reference.halves, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_our_points_shade_like_the_plugin(case, head, lit):
     """The closed form with visibility at these points is `sira_sg`, and without it the one with `visibility` off."""
     scene, lobes, field, _ = lit
@@ -165,6 +166,7 @@ def test_our_points_shade_like_the_plugin(case, head, lit):
         assert abs(difference.mean()) < 0.005 * other[inside].mean()
 
 
+@pytest.mark.slow
 def test_direct_light_agrees_with_the_path_tracer(case, head, lit):
     """Two programs, one integral: this package's estimator at the mesh's points, and `path` of depth 2."""
     scene, lobes, _, mesh = lit
@@ -178,6 +180,7 @@ def test_direct_light_agrees_with_the_path_tracer(case, head, lit):
     assert error < 0.03 * mean, "jittered points and the traced picture's pixels"
 
 
+@pytest.mark.slow
 def test_closed_form_in_both_precisions_and_by_monte_carlo(case, head, lit):
     """Single precision is within 1e-4 of double; Monte Carlo without shadows within the form's documented error;
     PhySG's form is farther from it."""
@@ -289,6 +292,7 @@ def scene_file(
     return path
 
 
+@pytest.mark.slow
 def test_a_scene_file_gives_head_light_and_sensor(avatar_path, tmp_path):
     case = load_case(scene_file(tmp_path / "scene.xml", avatar_path), 32)
     assert (case.width, case.height, case.roughness) == (32, 16, pytest.approx(0.4)) and case.lobes.shape == (1, 7)

@@ -113,6 +113,7 @@ def test_each_equation_is_in_one_place():
     assert found == EQUATIONS
 
 
+@pytest.mark.slow
 def test_readme_snippets_run(avatar_path, tmp_path, monkeypatch):
     """The Python of README runs as printed, but for the avatar's path and the size of the picture."""
     from sira_mi.sg.lights_io import write_lights

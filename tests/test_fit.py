@@ -232,6 +232,7 @@ def test_bad_input_is_one_clear_line(case, workshop, monkeypatch, capsys):
     assert sorted(p.name for p in workshop.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_command_line_from_outside(workshop, tmp_path):
     """The command as a process: exit code 2 and no traceback."""
     command = [sys.executable, "-m", "sira_mi.fit", "nowhere.png"]

@@ -48,6 +48,7 @@ def wheel(tmp_path_factory) -> Path:
     return next(built.glob("*.whl"))
 
 
+@pytest.mark.slow
 def test_the_wheel_is_the_product(wheel):
     """Plugins, scenes and models are in the wheel; studies, tests and training data are not."""
     with zipfile.ZipFile(wheel) as archive:

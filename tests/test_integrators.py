@@ -494,6 +494,7 @@ def test_the_parameters_tested_are_all_that_head_and_light_expose(movable):
     assert exposed - arrays == set(PLAIN_PARAMETERS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", PLAIN_PARAMETERS)
 def test_derivatives_of_the_closed_form_by_each_parameter_alone(movable, key):
     weight = weights(19) * interior(mi.render(movable).numpy()[:, :, 18])[:, :, None]
@@ -502,6 +503,7 @@ def test_derivatives_of_the_closed_form_by_each_parameter_alone(movable, key):
     check(movable, key, weight, change=3e-4 if shape else 2e-3, tolerance=3e-3 if shape else 1e-3)
 
 
+@pytest.mark.slow
 def test_radiance_is_differentiable_by_the_pose_alone(avatar, avatar_path):
     head = scenes.head(avatar_path, voxel=0.2, movable=True)
     head["bsdf"] = {"type": "diffuse"}

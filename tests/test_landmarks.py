@@ -142,6 +142,7 @@ def found(prior):
     return fit_landmark_model.Places(placed.astype(np.float32), true.astype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_prior_learns_where_its_heads_carry_landmarks(prior, found, tmp_path):
     """A linear relation is found, kept in the prior's file, and holds on heads left out; without it, places stay."""
     learned = fit_landmark_model.add_landmark_model(prior, found)

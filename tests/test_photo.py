@@ -138,6 +138,7 @@ def test_focal_length_and_damaged_exif(tmp_path, astronaut):
     assert load_photo(tmp_path / "odd.jpg").focal_35mm is None
 
 
+@pytest.mark.slow
 def test_huge_photo_is_averaged_in_linear_light(tmp_path):
     """62 megapixels of black and white columns: their linear mean is one half, their coded mean would be 0.21."""
     columns = np.zeros((7000, 8900), np.uint8)

@@ -183,6 +183,7 @@ def test_closed_form_pictures_with_and_without_the_plan(blob):
     assert (picture(blob, light, replace(planned, kept_lobes=(0,)), 20.0) != reference).any()
 
 
+@pytest.mark.slow
 def test_shared_shadings_change_pixels_by_less_than_their_bound(blob):
     """On a film whose pixels are small enough to share, with as much tolerance as that takes."""
     light, settings = Light(LOBES), everything("sg")
@@ -240,6 +241,7 @@ def test_late_bounces_add_less_than_their_bound(mean_head):
     assert (pictures[depth + 10] - pictures[2]).max() > 0.002 * white, "there are bounces"
 
 
+@pytest.mark.slow
 def test_without_a_specular_term_nothing_of_it_is_computed(avatar, tmp_path):
     """k_s = 0: the plan leaves the specular term out; the closed form stays the same, path tracing within its noise."""
     save_avatar(tmp_path / "matt.safetensors", replace(avatar, k_s=0.0))
@@ -325,6 +327,7 @@ def problem():
         return stage_problems(portrait, prior, PRIOR, Path(folder), settings)[APPEARANCE](tensors), settings, tensors
 
 
+@pytest.mark.slow
 def test_a_fit_with_and_without_the_plan_is_the_same(problem):
     """What the stages leave out is 0 or was computed before: gradients and results differ by rounding at most."""
     made, settings, tensors = problem

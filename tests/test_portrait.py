@@ -124,6 +124,7 @@ def test_mask_agrees_with_a_composite(astronaut, mask):
     assert (found & figure).sum() / (found | figure).sum() > 0.95
 
 
+@pytest.mark.slow
 def test_mask_keeps_only_the_chosen_person(astronaut):
     pair = np.concatenate([astronaut[:300, 80:380], astronaut[:300, 380:512], astronaut[:300, 80:380]], axis=1)
     faces = sorted(find_faces(pair), key=lambda f: f.box[0])
@@ -239,6 +240,7 @@ def test_small_face_in_a_large_photo_is_cropped(tmp_path, head, astronaut, face)
     assert portrait.mask[tuple(portrait.landmarks[1].astype(int)[::-1])] == 1
 
 
+@pytest.mark.slow
 def test_given_camera_is_made_square_and_follows_the_image(tmp_path, photo_file, head, astronaut, face):
     """A camera with K[0][0] != K[1][1]: landmarks and camera must agree in the resampled image."""
     camera = estimate_camera(face.landmarks, head, 512, 512)

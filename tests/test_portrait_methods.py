@@ -119,6 +119,7 @@ def test_a_fit_is_done_once_and_again_when_what_it_depends_on_changes(jobs, monk
     assert started == ["a.4"]
 
 
+@pytest.mark.slow
 def test_a_photo_without_a_face_is_a_result_that_says_so(tmp_path):
     """The table names what failed; it does not stop."""
     blank = tmp_path / "blank.png"

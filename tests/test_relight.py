@@ -69,12 +69,14 @@ def albedos(scene):
     return baked[:, mask], np.vstack(evaluate_in_chunks(networks, local.numpy()[:, mask]))
 
 
+@pytest.mark.slow
 def test_baked_albedos_tend_to_the_networks_with_the_mesh(avatar_path):
     coarse, fine = (np.abs(np.subtract(*albedos(baked_scene(avatar_path, voxel)))) for voxel in (0.2, 0.05))
     assert fine.max() < 0.01
     assert fine.mean() < 0.25 * coarse.mean(), "linear interpolation errs by the square of the spacing"
 
 
+@pytest.mark.slow
 def test_baked_albedos_follow_every_parameter(avatar, avatar_path, tmp_path):
     scene = baked_scene(avatar_path)
     params = mi.traverse(scene)
@@ -136,6 +138,7 @@ def test_the_head_turns_under_a_fixed_light(subject, integrator, kind):
         assert np.abs(first - second).mean() < 0.012 * second.mean(), "noise of 1024 samples a block"
 
 
+@pytest.mark.slow
 def test_closed_form_agrees_with_path_tracing_on_a_convex_head(subject):
     """Nothing on a convex body is shadowed and no light is reflected twice, so that the closed form is only as far
     from path tracing as its integrals are approximate."""
@@ -146,6 +149,7 @@ def test_closed_form_agrees_with_path_tracing_on_a_convex_head(subject):
     assert result.psnr > 35
 
 
+@pytest.mark.slow
 def test_passes_add_up_and_repeat(subject, monkeypatch):
     settings = RelightSettings(samples=10, voxel=0.2)
     scene = load_scene(load_head(subject, settings), VIEW, Light(LOBES), 0.0, settings)
@@ -203,6 +207,7 @@ def test_the_command_writes_both_images(avatar_path, lights, tmp_path, voxel):
     assert {p.name for p in tmp_path.iterdir()} == {"lights.json", "Bild ä 1.png", "Bild ä 1.exr"}
 
 
+@pytest.mark.slow
 def test_a_turntable_is_a_full_turn(avatar_path, lights, tmp_path, voxel, capsys):
     common = ["--lights", lights, "--integrator", "sg", "--spp", "1", "--size", "24"]
     assert main([avatar_path, *common, "--turntable", "2", "--out", str(tmp_path / "turn.v2")]) == 0
@@ -214,6 +219,7 @@ def test_a_turntable_is_a_full_turn(avatar_path, lights, tmp_path, voxel, capsys
     assert (images[1] == images[2]).all() and (images[0] != images[1]).any()
 
 
+@pytest.mark.slow
 def test_a_draft_is_close_to_the_closed_form(avatar_path, lights, tmp_path, voxel):
     """The mesh shaded once a pixel, of a smooth blob: not the same picture, and near to it."""
     common = ["--lights", lights, "--integrator", "sg", "--spp", "4", "--size", "96"]
@@ -224,6 +230,7 @@ def test_a_draft_is_close_to_the_closed_form(avatar_path, lights, tmp_path, voxe
     assert 0 < difference.mean() < 0.03 * full[full > 0].mean()
 
 
+@pytest.mark.slow
 def test_the_comparison_prints_its_figures(avatar_path, lights, tmp_path, voxel, capsys):
     assert (
         main([avatar_path, "--lights", lights, "--compare", "--spp", "8", "--size", "24", "--out", str(tmp_path / "c")])
@@ -287,6 +294,7 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     assert not any(out.iterdir())
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_one_line_and_code_2(tmp_path):
     command = [sys.executable, "-m", "sira_mi.relight", str(tmp_path / "nobody"), "--out", str(tmp_path / "x")]
     result = subprocess.run(command, capture_output=True, text=True, timeout=60)

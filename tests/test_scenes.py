@@ -59,6 +59,7 @@ def test_lights_and_visible_environment(avatar_path, one_light):
     np.testing.assert_allclose(image[0, 0, :3], behind, atol=0.02)
 
 
+@pytest.mark.slow
 def test_scale_is_that_of_the_light(avatar_path, one_light):
     images = [
         picture(load("relight.xml", avatar=avatar_path, lights=one_light, integrator="sira_sg", scale=scale))
@@ -77,6 +78,7 @@ def test_an_environment_map_is_taken_as_it_is_or_fitted(avatar_path):
     np.testing.assert_allclose(*(row.mean(axis=0) for row in rows), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_yaw_turns_the_head_and_not_the_light(avatar_path, one_light):
     still, turned = (
         load("relight.xml", avatar=avatar_path, lights=one_light, integrator="sira_sg", yaw=yaw) for yaw in (0, 90)
@@ -120,6 +122,7 @@ def test_avatars_are_found_beside_the_scene_and_in_the_current_folder(avatar, av
     assert picture(beside)[16, 16, :3].min() > 0
 
 
+@pytest.mark.slow
 def test_learned_radiance_is_that_of_the_scenes_own_avatar(avatar_path):
     own = load("fit.xml", avatar=avatar_path, integrator="sira_radiance")
     image = picture(own)

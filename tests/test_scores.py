@@ -141,6 +141,7 @@ def test_images_of_a_mesh_are_what_the_camera_sees(truth):
 SHIFTED = Similarity(1.08, Rotation.from_euler("xyz", [12, -35, 8], degrees=True).as_matrix(), np.array([0.4, -2, 1]))
 
 
+@pytest.mark.slow
 def test_a_similar_head_is_no_error_in_any_frame_but_the_raw_camera(truth, surface):
     """The truth in another world, at another size and as much farther away: one photo shows the same. Only without the
     scale about the camera's centre it is a head at another distance."""
@@ -165,6 +166,7 @@ def test_a_similar_head_is_no_error_in_any_frame_but_the_raw_camera(truth, surfa
     assert again == scores
 
 
+@pytest.mark.slow
 def test_icp_mends_wrong_landmarks(truth, surface):
     """Landmarks that err by 3 mm place the head wrongly; ICP brings it back."""
     off = truth.landmarks + 0.03 * np.random.default_rng(5).standard_normal(truth.landmarks.shape)
@@ -222,6 +224,7 @@ def test_larger_ball_is_as_far_as_its_radius_says():
     assert scores["camera_raw_head_truth_to_prediction_points"] > 3900
 
 
+@pytest.mark.slow
 def test_no_icp_hides_a_shift_in_the_camera_frame():
     """A ball that is 4 mm too far to the right is, over its whole surface, 2 mm away on average."""
     truth = ball_truth()

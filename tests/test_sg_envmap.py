@@ -102,6 +102,7 @@ def test_agrees_with_mitsubas_envmap():
         assert np.abs(radiance(emitter(**extra), directions) - expected).max() < 0.01 * expected.max()
 
 
+@pytest.mark.slow
 def test_path_traced_ball_agrees_with_mitsubas_envmap(tmp_path):
     """Emitter sampling, BSDF sampling and misses under `path`, against the written EXR."""
     write_exr(tmp_path / "lights.exr", render_environment(LOBES, 256))

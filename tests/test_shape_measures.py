@@ -162,6 +162,7 @@ def test_components_of_a_mesh(centres, parts):
 # Fits
 
 
+@pytest.mark.slow
 def test_a_fit_recovers_the_models_own_heads(model, own):
     scans, _ = own
     w = shape_measures.fit_shape(model, [scan.scene for scan in scans], ShapeFit(steps=200))
@@ -312,6 +313,7 @@ def test_the_command_writes_the_page_from_its_measurements(balls, coarse, tmp_pa
     assert text.startswith((tmp_path / "priors.md").read_text())
 
 
+@pytest.mark.slow
 def test_the_reference_of_the_ablations_differs_from_them(balls, coarse):
     """What `--without` leaves out is left out: after a few steps the networks differ."""
     collection, runs = balls

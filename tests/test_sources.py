@@ -87,6 +87,7 @@ def test_the_axis_turns_are_all_rotations_of_a_cube():
     assert np.allclose(np.linalg.det(turns), 1) and np.allclose(turns[0], np.eye(3))
 
 
+@pytest.mark.slow
 def test_hidden_and_grazing_marks_are_left_out(person):
     """With the brow behind a curtain of hair its landmarks are invalid, and the rest stays."""
     known, _ = mesh_landmarks(person.head)
