@@ -80,7 +80,7 @@ def test_the_page_tells_which_marks_are_met(figures):
     assert "| face, mm | ≤1 | 0.85 | met |" in text
     assert "| over the mean head's | ≤0.7 | 0.41 | met |" in text
     assert "| final render, dB | ≥34 | 0.8 | **missed** |" in text
-    assert "| a.4 minus best ablation, mm | ≤0 | – | – |" in text
+    assert "| geometry minus best ablation, mm | ≤0 | – | – |" in text
     assert "| fit, s | ≤300 | 41 | met |" in text
     assert "| p2 | a.3 | no face found |" in text
     assert "| smallest | 0.80 |" in text and "| largest | 0.90 |" in text

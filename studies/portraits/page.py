@@ -1,70 +1,17 @@
-"""`docs/results.md` from the figures of `docs/data/portraits.json`."""
+"""`docs/results.md`: `template.md` with the figures of `docs/data/portraits.json` filled in."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from sira_mi.files import write_text
 from studies.markdown import number, table
-from studies.portraits.compare_methods import MEAN_HEAD
-from studies.portraits.summary import GEOMETRY_METHOD, SHIPPED
 
 FIGURES = Path("data") / "portraits.json"  # beside the page
+TEMPLATE = Path(__file__).with_name("template.md")
 AT_MOST, AT_LEAST = "≤", "≥"
-
-PAGE = """# Results of the single-image fit
-
-{portraits} portraits of unseen heads ([benchmark](benchmark.md)), fitted at `{quality}` quality from the photo and its
-EXIF focal length alone. Measured at revision `{revision}` on {date}. Every portrait and score:
-[data/portraits.json](data/portraits.json). What was tried: [notebook](notebook/portraits.md).
-
-    python -m studies.portraits build --collection COLLECTION --out BENCHMARK
-    python -m studies.portraits fit --benchmark BENCHMARK --runs RUNS
-
-## Marks
-
-{marks}
-
-## Geometry
-
-{geometry}
-
-Mean distances, mm, both directions. `face`: skin and eyes within 95 mm of the nose tip, after alignment by six
-landmarks and ICP with scale (H3DS). `no ICP`: in the photo's camera frame, one scale about the camera's centre. `head`:
-above the shoulders, with hair. `hidden half`: what the photo does not show. `IoU` ignores the body 30 cm below the ears
-and lower. {geometry_method} is the fit's geometry; {shipped} continues from it, and its shading stage moves the surface
-where the quality has one.
-
-## Appearance
-
-{lights}
-
-PSNR and SSIM are of sRGB values inside the mask. `eq. 8` is the final render without the
-[refinement of the light](architecture.md#albedo-or-light): what albedo, light and shape explain by themselves. Specular
-albedo is the reflectance at normal incidence over 0.08. Last rows: extremes over portraits.
-
-## Ablations
-
-{ablations}
-
-All at `{ablation_quality}` quality, continuing from {geometry_method}. `scaled`: after one least-squares factor per
-channel. `leakage`: correlation of the log albedo's error on skin with the log of the light; 0 is none.
-
-## Limits
-
-- Heads are synthetic, neutral, with closed mouths: no expressions, glasses, hats or beards.
-- Regions have the specular levels of the training data, so specular scores measure how well regions are found.
-- The refinement of the light holds in the photo's own light only; relit, `eq. 8` remains.
-- Differences of 0.05 mm on the face are chance at about this number of heads.
-- Times are wall-clock, whole processes, two cores, no GPU.
-{failed}
-## Pictures
-
-Photo and fit; then fitted and true normals, diffuse albedo and specular albedo.
-
-![Photo, fit, and fitted and true normals and albedos](images/results.png)
-"""
 
 
 @dataclass(frozen=True)
@@ -125,12 +72,13 @@ def find(figures: dict, *path: str) -> Any:
 
 
 def _of_fit(group: str, score: str) -> Callable[[dict], float | None]:
-    return lambda figures: find(figures, "shipped", "methods", SHIPPED, group, score)
+    return lambda figures: find(figures, "shipped", "methods", figures["roles"]["shipped"], group, score)
 
 
 def _over_mean_head(figures: dict) -> float | None:
     fit, mean = (
-        find(figures, "shipped", "methods", name, "geometry", "h3ds_face_mean") for name in (SHIPPED, MEAN_HEAD)
+        find(figures, "shipped", "methods", figures["roles"][role], "geometry", "h3ds_face_mean")
+        for role in ("shipped", "baseline")
     )
     return None if fit is None or mean is None else fit / mean
 
@@ -139,17 +87,17 @@ def _gain_over_ablations(figures: dict) -> float | None:
     """Of the fit's geometry over the best of the methods before it."""
     methods = figures["ablations"]["methods"]
     found = {name: find(methods, name, "geometry", "h3ds_face_mean") for name in methods if name.startswith("a.")}
-    own = found.pop(GEOMETRY_METHOD, None)
+    own = found.pop(figures["roles"]["geometry"], None)
     others = [value for value in found.values() if value is not None]
     return None if own is None or not others else own - min(others)
 
 
 def _draft_face(figures: dict) -> float | None:
     """Of the shipped method, or of its geometry stages where nothing after them moves the shape."""
-    methods = figures["ablations"]["methods"]
-    if SHIPPED not in methods:
+    methods, shipped = figures["ablations"]["methods"], figures["roles"]["shipped"]
+    if shipped not in methods:
         return None
-    last = SHIPPED if "geometry" in methods[SHIPPED] else GEOMETRY_METHOD
+    last = shipped if "geometry" in methods[shipped] else figures["roles"]["geometry"]
     return find(methods, last, "geometry", "h3ds_face_mean")
 
 
@@ -163,7 +111,7 @@ MARKS = (
     Mark("over the mean head's", AT_MOST, 0.7, _over_mean_head),
     Mark("face, no ICP, mm", AT_MOST, 1.5, _of_fit("geometry", "camera_face_mean")),
     Mark("face normals, °", AT_MOST, 8, _of_fit("geometry", "normals_mean"), 1),
-    Mark(f"{GEOMETRY_METHOD} minus best ablation, mm", AT_MOST, 0, _gain_over_ablations),
+    Mark("geometry minus best ablation, mm", AT_MOST, 0, _gain_over_ablations),
     Mark("silhouette IoU", AT_LEAST, 0.97, _of_fit("geometry", "silhouette_iou"), 3),
     Mark("final render, dB", AT_LEAST, 34, _of_fit("appearance", "final_psnr"), 1),
     Mark("final render, SSIM", AT_LEAST, 0.95, _of_fit("appearance", "final_ssim"), 3),
@@ -188,18 +136,21 @@ def write_page(figures: dict, out: Path) -> Path:
 def render_page(figures: dict) -> str:
     """The page's Markdown."""
     shipped, ablations = figures["shipped"], figures["ablations"]
-    return PAGE.format(
+    return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         portraits=figures["portraits"],
         revision=figures["measured"]["revision"],
         date=figures["measured"]["date"],
         quality=shipped["quality"],
         ablation_quality=ablations["quality"],
-        geometry_method=GEOMETRY_METHOD,
-        shipped=SHIPPED,
+        geometry_method=figures["roles"]["geometry"],
+        shipped_method=figures["roles"]["shipped"],
         marks=_marks(figures),
         geometry=table(
             ("", "quality", *(c.title for c in GEOMETRY_COLUMNS)),
-            [*_geometry_rows(shipped), *(row for row in _geometry_rows(ablations) if row[0] != MEAN_HEAD)],
+            [
+                *_geometry_rows(shipped),
+                *(row for row in _geometry_rows(ablations) if row[0] != figures["roles"]["baseline"]),
+            ],
         ),
         lights=_lights(figures),
         ablations=table(
@@ -241,7 +192,7 @@ def _geometry_rows(quality: dict) -> list[list[str]]:
 
 def _lights(figures: dict) -> str:
     """Rows of the shipped fit: all portraits, each light, and the smallest and largest value over portraits."""
-    fit = find(figures, "shipped", "methods", SHIPPED) or {}
+    fit = find(figures, "shipped", "methods", figures["roles"]["shipped"]) or {}
     everywhere = {**fit.get("geometry", {}), **fit.get("appearance", {})}
     lines = [["all", *_cells(everywhere, LIGHT_COLUMNS)]]
     lines += [[light, *_cells(scores, LIGHT_COLUMNS)] for light, scores in figures["lights"].items()]

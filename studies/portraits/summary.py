@@ -38,13 +38,15 @@ APPEARANCE_SCORES = (
 
 
 def summarise(shipped: Sequence[dict], ablations: Sequence[dict], quality: str, ablation_quality: str) -> dict:
-    """The figures of the page: `portraits`, their number; `shipped` and `ablations`, the rows of each by method; the
-    shipped fit's scores by light in `lights` and by portrait in `each`; and the fits that `failed`."""
+    """The figures of the page: `portraits`, their number; `roles`, the names of the methods that the page refers to;
+    `shipped` and `ablations`, scores and costs by method; the shipped fit's scores by light in `lights` and by portrait
+    in `each`; and the fits that `failed`."""
     own = [row for row in shipped if row["method"] == SHIPPED]
     lights = sorted({row["light"] for row in own})
     mean_head = {row["portrait"]: row["scores"]["h3ds_face_mean"] for row in shipped if row["method"] == MEAN_HEAD}
     return {
         "portraits": len(mean_head),
+        "roles": {"baseline": MEAN_HEAD, "geometry": GEOMETRY_METHOD, "shipped": SHIPPED},
         "shipped": _summarise_quality(shipped, quality),
         "ablations": _summarise_quality(ablations, ablation_quality),
         "lights": {light: _means([row for row in own if row["light"] == light]) for light in lights},

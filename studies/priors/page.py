@@ -1,72 +1,18 @@
-"""`docs/priors.md` and `docs/prior_trainings.md` from the figures of `docs/data/priors.json`."""
+"""`docs/priors.md` and `docs/prior_trainings.md`: templates with the figures of `docs/data/priors.json` filled in."""
 
 from collections.abc import Callable
 from pathlib import Path
+from string import Template
 
 from sira_mi.files import write_text
 from studies.markdown import number, percent, table
 
-FIGURES = Path("data") / "priors.json"  # beside the page
+FIGURES = Path("data") / "priors.json"  # beside the pages
+TEMPLATE, TRAININGS_TEMPLATE = (Path(__file__).with_name(name) for name in ("template.md", "trainings_template.md"))
 
 # What the shape latents have to reach: face and head, mm; the face's share of the mean head's error; the share of
 # random heads' surface points with a gradient of length 0.9 to 1.1.
 FACE_LIMIT, HEAD_LIMIT, FACE_SHARE, GRADIENT_SHARE = 1.0, 2.0, 0.5, 0.95
-
-PAGE = """# How good the priors are
-
-Measured on the collection's test split, which no training has seen, at revision `{revision}` on {date}. All figures:
-[data/priors.json](data/priors.json). Loss terms and network sizes: [short trainings](prior_trainings.md). What was
-tried: [notebook](notebook/priors.md).
-
-    python -m studies.priors measure --collection COLLECTION --runs RUNS
-
-{data}
-
-## Marks
-
-{marks}
-
-## Shape latents fitted to unseen heads
-
-{shape}
-
-## By source, ancestry, sex and age
-
-{groups}
-
-## Random heads and landmarks
-
-{heads}
-
-## Appearance latents fitted to unseen heads
-
-{appearance}
-
-## Limits
-
-- Groups of a few scans say little.
-- Surfaces that a scan lacks, such as a leftover of another head's hair, count with their full distance.
-- Every head is synthetic, neutral and closed-mouthed ([what the prior cannot do](prior.md#limits)).
-"""
-
-TRAININGS = """# What loss terms and network sizes are for
-
-Short trainings that differ in one thing. They are comparable with one another only. Measured at revision `{revision}`
-on {date}; all columns are in [data/priors.json](data/priors.json).
-
-    python -m studies.priors measure --collection COLLECTION --runs RUNS
-    python -m studies.priors sizes --collection COLLECTION --runs RUNS
-
-## Loss terms
-
-{terms}
-
-## Network sizes
-
-{sizes}
-
-On a shared machine the costs vary by a third between runs.
-"""
 
 SHAPE = """Only the shape latents of {scans} scans are fitted: {steps} steps of Adam, {points} points each. The networks
 stay fixed and nothing is aligned. Distances in mm, averaged over scans.
@@ -140,7 +86,7 @@ def render_pages(figures: dict) -> dict[str, str]:
         return write(figures)
 
     return {
-        "priors.md": PAGE.format(
+        "priors.md": Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
             **figures["measured"],
             data=section(_data, "measure", "collection", "training"),
             marks=section(_marks, "measure", "shape", "random_heads"),
@@ -149,7 +95,7 @@ def render_pages(figures: dict) -> dict[str, str]:
             heads=section(_heads, "measure", "random_heads", "directions", "landmarks"),
             appearance=section(_appearance, "measure", "appearance"),
         ),
-        "prior_trainings.md": TRAININGS.format(
+        "prior_trainings.md": Template(TRAININGS_TEMPLATE.read_text(encoding="utf-8")).substitute(
             **figures["measured"],
             terms=section(_terms, "measure", "ablations", "appearance_ablations"),
             sizes=section(_sizes, "sizes", "sizes"),
