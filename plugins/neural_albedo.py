@@ -45,15 +45,15 @@ class NeuralAlbedo(mi.Texture):
        - `diffuse` (three channels, eqs 9a and 11) or `specular` (one channel, eq. 9b). (Default: `diffuse`)
      * - baked
        - |bool|
-       - Evaluate the networks once at every vertex of the `neural_sdf` that this texture belongs to, and interpolate
-         between vertices. (Default: false)
+       - Evaluate the networks once per vertex of the `neural_sdf` that owns this texture, and interpolate. (Default:
+         false)
      * - weights
        - |Float|
        - Flat parameters of the albedo network.
        - |exposed|, |differentiable|
      * - latent
        - |Float|
-       - z_a of the diffuse, z_s of the specular albedo.
+       - Latent code: z_a (`diffuse`) or z_s (`specular`).
        - |exposed|, |differentiable|
      * - refinement
        - |Float|
@@ -64,22 +64,21 @@ class NeuralAlbedo(mi.Texture):
        - Weight of the refinement, eq. 11 (`diffuse` only). (Default: the avatar's)
        - |exposed|, |differentiable|
 
-    The albedo is a neural field over SIRA's reference space: the surface point is first mapped by the deformation
-    network to x_ref and the features γ. Inside the BSDF of a `neural_sdf`, deformation, latent and transform are that
-    shape's own, so that they follow its updates and receive its gradients; anywhere else they are the avatar's.
+    A neural field over SIRA's reference space: the deformation network maps a surface point to x_ref and features γ,
+    from which the albedo network predicts the albedo. Inside the BSDF of a `neural_sdf`, deformation, shape latent and
+    transform are that shape's, and gradients flow to them; elsewhere they are the avatar's.
 
-    Works inside any stock BSDF and in symbolic loops: networks are evaluated as cooperative vectors. Call
-    `params.update()` after gradients are enabled. The three-channel texture gives its luminance where one channel is
-    asked for; the one-channel texture gives grey where three are.
+    Works in any stock BSDF and inside symbolic loops, where networks are evaluated as cooperative vectors. Call
+    `params.update()` after enabling gradients. If one channel is asked of a three-channel texture, it returns the
+    luminance; if three are asked of a one-channel texture, it returns grey.
 
-    Networks make most of the cost of path tracing a head; and Mitsuba compiles those of every texture that is alive in
-    the process into the kernels of every picture, also of other scenes. A `baked` texture is looked up instead: the
-    shape keeps its albedo as the mesh attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (a number is
-    appended where several baked textures of one kind share a head) and renews it whenever parameters are changed
-    through the scene or the shape. It is as sharp as the mesh is fine: give the shape a `voxel` of 0.03 or less. It is
-    detached: no gradient reaches this texture's parameters, and enabling one raises RuntimeError at the next render.
-    Outside of a `neural_sdf` it cannot be evaluated. `sira_sg` evaluates the networks in either case, unless its
-    `exact` is switched off.
+    The networks dominate the cost of path tracing a head, and Mitsuba compiles the networks of all live textures into
+    every kernel, even those of other scenes. A `baked` texture avoids this: the shape stores the albedo as the mesh
+    attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (with a number appended if a head has several of one
+    kind) and updates it whenever parameters change through the scene or the shape. Its detail is limited by the mesh;
+    use a `voxel` of 0.03 or less. It has no gradients: enabling one raises RuntimeError at the next render, as does
+    using it outside a `neural_sdf`. `sira_sg` evaluates the networks even if a texture is baked, unless its `exact` is
+    false.
 
     Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
 

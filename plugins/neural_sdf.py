@@ -27,15 +27,14 @@ class NeuralSDF(mi.Mesh):
        - An `avatar.safetensors`; empty for the mean head of the shipped prior. (Default: empty)
      * - voxel
        - |float|
-       - Spacing of the grid that the mesh is extracted on, in scene units of 100 mm. (Default: 0.05)
+       - Spacing of the grid from which the mesh is extracted, in scene units of 100 mm. (Default: 0.05)
      * - remesh_every
        - |int|
-       - The mesh is extracted again at every n-th update of the parameters. With 1, it also carries gradients. With
-         more, it stays where it is in between and carries none: for integrators that refine hits on the field
-         itself. (Default: 1)
+       - Extract the mesh again at every n-th parameter update. With 1 the mesh carries gradients. With more it is kept
+         in between and carries none, which suits integrators that refine hits on the field. (Default: 1)
      * - movable
        - |bool|
-       - Whether `pose` is exposed. (Default: false)
+       - Expose `pose`. (Default: false)
      * - to_world
        - |transform|
        - Rotation, translation and uniform scale. (Default: identity)
@@ -49,28 +48,27 @@ class NeuralSDF(mi.Mesh):
        - |exposed|, |differentiable|, |discontinuous|
      * - pose
        - |Float|
-       - Rotation vector (radians) and translation (scene units) of points before they enter the field: moves the head
-         by the inverse. Exposed where the shape is `movable`.
+       - Rotation vector (radians) and translation (scene units) applied to points before they enter the field, which
+         moves the head by the inverse. Exposed if the shape is `movable`.
        - |exposed|, |differentiable|, |discontinuous|
      * - (Nested plugin)
        - |bsdf|
-       - Any BSDF. A `neural_albedo` inside it takes its reference space from this shape; baked ones are kept as
-         attributes of the mesh.
+       - Any BSDF. A `neural_albedo` inside it uses this shape's reference space; baked ones become mesh attributes.
 
-    The field is SIRA's composed SDF: a deformation network maps a point and the latent to an offset δ and a feature
-    vector γ (eq. 1), and the reference SDF is evaluated at x + δ (eqs 2 and 3). Its zero level set inside the domain
-    box is extracted as a closed triangle mesh, whose vertices are moved onto the level set by Newton steps and
-    attached to the field's parameters by implicit differentiation,
+    SIRA's composed signed distance field: a deformation network maps a point and the latent to an offset δ and features
+    γ (eq. 1), and the reference network is evaluated at x + δ (eqs 2 and 3). The zero level set inside the domain box
+    is extracted as a closed triangle mesh. Newton steps move its vertices onto the level set, and implicit
+    differentiation attaches them to the field's parameters,
 
         x(θ) = x₀ − ∇f (f(x₀; θ) − f(x₀; θ₀)) / |∇f|²,
 
-    so that every Mitsuba integrator sees a mesh, silhouette gradients of `direct_projective` and `prb_projective`
-    included. This project's own integrators refine hits on the field itself (`refine`).
+    so every Mitsuba integrator sees a mesh, and `direct_projective` and `prb_projective` find silhouette gradients.
+    This project's integrators refine hits on the field itself (`refine`).
 
-    Geometry must be changed through the *scene's* parameters (`mi.traverse(scene)`), and `params.update()` be called
-    after gradients are enabled. The shape has no UVs, is not an emitter with a stable area measure, and where it meets
-    the domain box it is closed flat, without gradients. When a scene is loaded, Mitsuba merges meshes whose BSDFs are
-    equal into one, which takes a head's parameters away: give it a BSDF of its own, or load with `optimize=False`.
+    Change the geometry through the *scene's* parameters (`mi.traverse(scene)`), and call `params.update()` after
+    enabling gradients. The shape has no UVs and should not be used as an area light. Where it meets the domain box it
+    is closed by a flat cap without gradients. On loading, Mitsuba merges meshes with equal BSDFs, which would hide a
+    head's parameters: give it a BSDF of its own, or load with `optimize=False`.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.1; implicit differentiation as in IDR (Yariv et al. 2020).
 

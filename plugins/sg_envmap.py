@@ -26,7 +26,7 @@ class SGEnvmap(mi.Emitter):
 
      * - lobes
        - |tensor|
-       - N_l × 7: axis (3, any length but zero), sharpness λ > 0, linear RGB amplitude (3, not negative); 1 to 4096
+       - N_l × 7: axis (3, any non-zero length), sharpness λ > 0, linear RGB amplitude (3, not negative); 1 to 4096
          lobes. (Default: one near-constant lobe of radiance 0.2)
        - |exposed|, |differentiable|
 
@@ -37,7 +37,7 @@ class SGEnvmap(mi.Emitter):
 
      * - lobe_count
        - |int|
-       - Lobes that are fitted to an `.exr`. (Default: 64)
+       - Number of lobes fitted to an `.exr`. (Default: 64)
 
      * - scale
        - |float|
@@ -48,16 +48,16 @@ class SGEnvmap(mi.Emitter):
        - |transform|
        - Rotation of the environment. (Default: none)
 
-    The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)); Mitsuba's `envmap` of the same light shows it in the
-    same directions. Light is sampled by choosing a lobe by the luminance of its energy and a direction from its von
-    Mises-Fisher density; the density is that of the whole mixture.
+    The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)), oriented like Mitsuba's `envmap`. To sample it, a lobe
+    is chosen in proportion to the luminance of its energy, then a direction from the lobe's von Mises-Fisher density.
+    The sampling density is that of the whole mixture.
 
-    It does not emit rays (`sample_ray`): particle tracers such as `ptracer` cannot use it. It needs an RGB or
-    monochrome variant, and scenes much smaller than 1e5 units, the distance at which it places its light. Derivatives
-    go through the radiance, not through the sampling. Inside Mitsuba's symbolic loops the gradients of `lobes` are
-    summed by atomic additions: their last bits vary from run to run.
+    It does not emit rays (`sample_ray`), so particle tracers such as `ptracer` cannot use it. It needs an RGB or
+    monochrome variant and a scene much smaller than 1e5 units, the distance at which the light is placed. Derivatives
+    flow through the radiance, not through the sampling. Inside Mitsuba's symbolic loops, gradients of `lobes` are
+    summed by atomics, and their last bits vary between runs.
 
-    Source: the light model of eq. 8 of SIRA (Caselles et al. 2023), after PhySG (Zhang et al. 2021).
+    Source: the light model of eq. 8 of SIRA (Caselles et al. 2022), after PhySG (Zhang et al. 2021).
 
     .. code-block:: python
 

@@ -28,7 +28,7 @@ class SiraBSDF(mi.BSDF):
 
      * - roughness
        - |float|
-       - r, from 0.02 to 1. (Default: 0.5)
+       - Roughness r, from 0.02 to 1. (Default: 0.5)
        - |exposed|, |differentiable|
 
      * - k_s
@@ -37,15 +37,14 @@ class SiraBSDF(mi.BSDF):
        - |exposed|, |differentiable|
 
     f = a/π + k_s D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴),
-    F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and Schlick-Smith's G with k = (r + 1)²/8: the formulas of
-    `sira_mi.sg.brdf`, as in closed-form shading.
+    F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and Schlick-Smith's G with k = (r + 1)²/8: the reflectance that
+    closed-form shading integrates (`sira_mi.sg.brdf`).
 
-    One-sided; nest it in `twosided` for both. It is reciprocal. It does not conserve energy: the diffuse term is not
-    reduced by what the specular term reflects, nor is the specular term normalised at grazing angles; with a = 0 and
-    s = 1 the model itself reflects more than it receives, and this plugin neither adds to that nor hides it.
-    Directions are sampled from a mixture of the cosine lobe and the reflected normal distribution.
+    One-sided; nest it in `twosided` for both sides. Reciprocal, but not energy-conserving: the diffuse term is not
+    reduced by what the specular term reflects, and the specular term is not normalised at grazing angles. Directions
+    are sampled from a mixture of the cosine lobe and the reflected normal distribution.
 
-    Source: SIRA (Caselles et al. 2023), eq. 8, after PhySG (Zhang et al. 2021) and Karis, "Real Shading in Unreal
+    Source: SIRA (Caselles et al. 2022), eq. 8, after PhySG (Zhang et al. 2021) and Karis, "Real Shading in Unreal
     Engine 4" (2013).
 
     .. code-block:: python
@@ -121,7 +120,7 @@ class SiraBSDF(mi.BSDF):
     def _density(self, si, wo, share, active):
         with dr.suspend_grad():
             active = active & ((mi.Frame3f.cos_theta(si.wi) > 0.0) & (mi.Frame3f.cos_theta(wo) > 0.0))
-            glossy = brdf.reflected_density(mi.Vector3f(0, 0, 1), si.wi, wo, self.roughness)
+            glossy = brdf.reflection_density(mi.Vector3f(0, 0, 1), si.wi, wo, self.roughness)
             return dr.select(active, dr.lerp(mi.warp.square_to_cosine_hemisphere_pdf(wo), glossy, share), 0.0)
 
     def sample(self, ctx, si, sample1, sample2, active=True):

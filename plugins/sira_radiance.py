@@ -41,20 +41,19 @@ class SiraRadiance(mi.SamplingIntegrator):
        - Appearance latent.
        - |exposed|, |differentiable|
 
-    Shows a scene's `neural_sdf` by its learned, non-physical radiance r(x_ref, n, v, γ) (eq. 4), as section 3.2.1 fits
-    it to a photo: no light is needed, other shapes only occlude. Hits are exact, on the field and not on its mesh, and
-    differentiable by implicit differentiation in the shape's latent and networks (`head.z_sdf`, `head.deformation`,
-    `head.reference`), through positions, normals and features; the rendering function in `z_r` and `rendering`.
+    Renders a scene's `neural_sdf` by its learned, non-physical radiance r(x_ref, n, v, γ) (eq. 4), as section 3.2.1
+    fits it to a photo. It ignores lights; other shapes only occlude. Hits lie on the field, not on its mesh, and are
+    differentiable by implicit differentiation with respect to the shape's latent, networks and pose. The rendering
+    function is differentiable with respect to `z_r` and `rendering`.
 
-    Besides colour and alpha (1 where the ray hits the head), two channels are given: `mask`, the soft mask
-    σ(−α min f) of IDR, and `closest`, min f along the ray in scene units (1 for rays outside the domain box), from
-    which a mask loss is computed stably. Silhouettes get their gradients from these, colours theirs from the inside.
+    Besides colour and alpha (1 where the ray hits the head) there are two channels: `mask`, IDR's soft mask
+    σ(−α min f), and `closest`, min f along the ray in scene units (1 for rays outside the domain box), from which a
+    mask loss can be computed stably. Silhouette gradients come from these channels; those of the colour come from
+    inside the silhouette.
 
-    Without an `avatar` of its own, the networks are known from the first render on, and `rendering` and `z_r` are
-    exposed from then on; give `avatar` to differentiate them from the start.
-
-    Networks are evaluated in tensor mode on all rays of a pass at once, so this integrator cannot be nested in
-    symbolic code.
+    Without an `avatar`, the networks are loaded at the first render, and `rendering` and `z_r` are exposed from then
+    on; give `avatar` to differentiate them from the start. Not available inside symbolic code, since the networks are
+    evaluated in tensor mode on all rays of a pass.
 
     Source: SIRA (Caselles et al. 2022), eq. 4 and section 3.2.1; IDR (Yariv et al. 2020).
 
@@ -83,6 +82,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         return avatar.architecture
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
+        # Scene and hits.
         head = find_head(scene, "sira_radiance")
         architecture = self.architecture or self._load(head.avatar_path)
         ray = mi.Ray3f(dr.detach(ray))
@@ -91,7 +91,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         t, hit = trace_head(scene, head, ray, active)
         field = head.field()
 
-        closest = self._closest(head, field, local, active, width)
+        # Colour: eq. 4 at the hits, in tensors, one column a hit.
         color = dr.zeros(mi.Color3f, width)
         index = dr.compress(hit)
         if dr.width(index) > 0:
@@ -102,13 +102,16 @@ class SiraRadiance(mi.SamplingIntegrator):
             octaves = architecture.rendering_octaves
             radiance = render_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
             color = scatter_columns(radiance, index, width, mi.Color3f)
+
+        # Mask: by the closest approach of every ray.
+        closest = self._closest(head, field, local, active, width)
         mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
         return color, hit, [mask, closest]
 
     @staticmethod
     def _closest(head: NeuralSDF, field, local, active, width: int):
-        """min f along the rays (Float): located on the shape's distance grid, where it decides the mask also on the
-        field, and evaluated on the field."""
+        """min f along the rays (Float): evaluated on the field, at a place found on the shape's distance grid. Near the
+        outline, where it decides the mask, the place is found on the field."""
         box = mi.BoundingBox3f(mi.Point3f(*DOMAIN_LOWER), mi.Point3f(*DOMAIN_UPPER))
         inside, near, far = box.ray_intersect(local)
         inside &= active

@@ -27,7 +27,7 @@ from sira_mi.plugins.sg_envmap import SGEnvmap
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg.layers import EXTRA_LAYERS, channel_count, extra_channel_names
 from sira_mi.sg.multisampling import representative_samples
-from sira_mi.sg.radiance import Material, Radiance, reflected_radiance
+from sira_mi.sg.radiance import Material, Radiance, closed_form_radiance
 from sira_mi.sg.visibility import (
     DEFAULT_DIRECTIONS,
     SHADOW_OFFSET,
@@ -317,7 +317,7 @@ class HeadShader:
             visibility = light_visibility(
                 normal, view, specular, bsdf.roughness, self.lobes, self.directions, unoccluded
             )
-        return reflected_radiance(normal, view, material, self.shaded_lobes, visibility)
+        return closed_form_radiance(normal, view, material, self.shaded_lobes, visibility)
 
     def _albedo(self, texture, x, x_ref, gamma, rows: int):
         """The albedo [rows, N] of a texture at points x, which lie at x_ref in reference space."""

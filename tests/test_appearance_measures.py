@@ -16,7 +16,7 @@ from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, signed_distance_and_slope
 from sira_mi.portrait.landmarks import BARE_SKIN
-from sira_mi.sg.radiance import Material, radiance_of_scenes, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance, radiance_of_scenes
 from sira_mi.training import af_sm
 from sira_mi.training.prior import assemble_prior
 from sira_mi.training.scenes import TrainingScene
@@ -109,7 +109,7 @@ def shaded(lit_points, per_scene: bool):
             mine = slice(7 * k, 7 * k + 7)
             white = mi.TensorXf(np.full((3, 7), np.pi, np.float32))
             material = Material(white, specular[:, mine], 0.5, 1.0)
-            both = reflected_radiance(normals[:, mine], views[:, mine], material, lobes[:, :, k])
+            both = closed_form_radiance(normals[:, mine], views[:, mine], material, lobes[:, :, k])
             parts.append(both[0] + 2.0 * both[1])
         radiance = dr.concat(parts, axis=1)
     else:
@@ -121,7 +121,7 @@ def shaded(lit_points, per_scene: bool):
 
 
 def test_scenes_shaded_together_are_those_shaded_alone(lit_points):
-    """`reflected_radiance`, scene by scene, is the reference, gradients included."""
+    """`closed_form_radiance`, scene by scene, is the reference, gradients included."""
     for together, alone in zip(shaded(lit_points, False), shaded(lit_points, True), strict=True):
         assert np.abs(alone).max() > 0.01
         np.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-4 * np.abs(alone).max())

@@ -10,7 +10,7 @@ import pytest
 from conftest import camera
 
 from sira_mi.avatar.file import load_avatar
-from sira_mi.export.scene_file import fitted_scene, scene_xml, write_scene
+from sira_mi.export.scene_file import scene_of_fit, scene_xml, write_scene
 from sira_mi.sg.lights_io import read_lights, write_lights
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -146,7 +146,7 @@ def test_what_scene_files_cannot_hold_is_said():
 
 def test_the_shipped_scene_is_that_of_the_descriptions():
     """`fit.xml` says the same of a head, its light and its integrator as the scene of a fit does."""
-    shipped, fitted = ET.parse(SCENES / "fit.xml").getroot(), ET.fromstring(scene_xml(fitted_scene(camera(40.0)), ""))
+    shipped, fitted = ET.parse(SCENES / "fit.xml").getroot(), ET.fromstring(scene_xml(scene_of_fit(camera(40.0)), ""))
     for element in ("shape", "emitter", "sensor/film/rfilter", "sensor/sampler"):
         one, other = (ET.canonicalize(ET.tostring(root.find(element)), strip_text=True) for root in (shipped, fitted))
         assert one == other, element

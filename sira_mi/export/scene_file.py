@@ -24,7 +24,7 @@ _COMMENT = """A head fitted by SIRA for Mitsuba 3: import sira_mi; mitsuba.load_
 _VALUES = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
-def fitted_scene(camera: Camera) -> dict:
+def scene_of_fit(camera: Camera) -> dict:
     """The scene of a fit: the avatar and its light, from files beside the scene file, before the photo's camera."""
     eye = sensor(camera, {"type": "independent", "sample_count": Parameter("spp", 16)})
     eye["film"] |= {"width": Parameter("width", camera.width), "height": Parameter("height", camera.height)}
@@ -77,5 +77,5 @@ def scene_xml(description: dict, comment: str) -> str:
 
 def write_scene(path: Path, camera: Camera) -> None:
     """`scene.xml` of a fit: opened by `mi.load_file` after `import sira_mi`."""
-    text = scene_xml(fitted_scene(camera), _COMMENT)
+    text = scene_xml(scene_of_fit(camera), _COMMENT)
     write_through(path, lambda p: p.write_text(text, encoding="utf-8"))

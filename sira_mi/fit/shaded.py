@@ -17,7 +17,7 @@ from sira_mi.fields.sdf import surface
 from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
-from sira_mi.sg.radiance import Material, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance
 from sira_mi.sg.visibility import SHADOW_OFFSET, even_directions, light_visibility, trace_unoccluded
 
 # Directions in which the points' visibility is traced.
@@ -115,7 +115,7 @@ def shade_points(avatar: Avatar, tensors: dict, k_s: float | None, points: Photo
     unoccluded, directions = mi.TensorXf(points.unoccluded.astype(np.float32)), even_directions(DIRECTIONS)
     visibility = light_visibility(normal, view, specular, avatar.roughness, lobes, directions, unoccluded)
     material = Material(albedo, specular, avatar.roughness, 0.0 if k_s is None else k_s)
-    return Shading(lobes, *reflected_radiance(normal, view, material, lobes, visibility))
+    return Shading(lobes, *closed_form_radiance(normal, view, material, lobes, visibility))
 
 
 def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):

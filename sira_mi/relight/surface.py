@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sira_mi.fields.columns import evaluate_in_chunks, from_columns, unit_columns
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.sg.multisampling import COSINE
-from sira_mi.sg.radiance import Material, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance
 from sira_mi.sg.visibility import (
     DEFAULT_DIRECTIONS,
     SHADOW_OFFSET,
@@ -125,7 +125,7 @@ def _tensor(array):
 
 def _radiance(points: Surface, view, roughness, k_s, lobes, visibility: Visibility | None = None) -> np.ndarray:
     material = Material(_tensor(points.albedo), _tensor(points.specular), roughness, k_s)
-    radiance = reflected_radiance(_tensor(points.normal), _tensor(view), material, _tensor(lobes), visibility)
+    radiance = closed_form_radiance(_tensor(points.normal), _tensor(view), material, _tensor(lobes), visibility)
     return radiance.diffuse.numpy() + radiance.specular.numpy()
 
 

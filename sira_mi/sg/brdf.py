@@ -75,7 +75,7 @@ def sample_distribution(sample: Point2f, roughness: Float) -> Vector3f:
     return mi.Vector3f(sine * cos_phi, sine * sin_phi, 1.0 - gap)
 
 
-def reflected_density(normal: Vector3f, view: Vector3f, light: Vector3f, roughness: Float) -> Float:
+def reflection_density(normal: Vector3f, view: Vector3f, light: Vector3f, roughness: Float) -> Float:
     """Density per steradian of `view` reflected about a half vector of `sample_distribution`.
 
     h and −h reflect alike, so both count; the Jacobian is 1/(4 |v·h|)."""

@@ -50,7 +50,7 @@ def reflect(
     return Radiance(diffuse, dr.zeros(mi.TensorXf, diffuse.shape) if specular is None else specular * material.k_s)
 
 
-def reflected_radiance(
+def closed_form_radiance(
     normals: TensorXf,
     views: TensorXf,
     material: Material,
@@ -70,8 +70,8 @@ def reflected_radiance(
 def radiance_of_scenes(
     normals: TensorXf, views: TensorXf, material: Material, lobes: TensorXf, scenes: int
 ) -> Radiance:
-    """`reflected_radiance` without visibility at the points of `scenes` S scenes in one launch: each scene's points are
-    consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
+    """`closed_form_radiance` without visibility at the points of `scenes` S scenes in one launch: each scene's points
+    are consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
     differentiable in albedos and lobes."""
     point = _shading_points(normals, views, material)
     irradiance, specular = map(to_columns, shade_scenes(*point, material.roughness, lobes, scenes))

@@ -87,7 +87,7 @@ def table_variables(cosine: Float, roughness: Float) -> tuple[Float, Float]:
     return grazing, (within - middle) * (1.0 / half_span)
 
 
-def tabulated_shape(cosine: Float, roughness: Float) -> LobeShape:
+def shape_from_tables(cosine: Float, roughness: Float) -> LobeShape:
     """The tables at a view cosine in (0, 1] and a roughness."""
     variables = table_variables(cosine, roughness)
     cosine_terms, roughness_terms = (
@@ -113,7 +113,9 @@ def log_energy(cosine: Float, roughness: Float) -> tuple[Float, Float]:
     return white, white + brdf.log_fresnel_weight(half)
 
 
-def shaped_lobes(normal: Vector3f, view: Vector3f, roughness: Float, shape: LobeShape, cosine: Float) -> SpecularLobes:
+def lobes_of_shape(
+    normal: Vector3f, view: Vector3f, roughness: Float, shape: LobeShape, cosine: Float
+) -> SpecularLobes:
     """The lobes of a given shape, for a view of that `cosine` above the surface."""
     sharpness = 0.25 * brdf.distribution_sharpness(roughness)
     mirror = 2.0 * cosine * normal - view
@@ -139,7 +141,7 @@ def specular_lobes(normal: Vector3f, view: Vector3f, roughness: Float) -> Specul
     cosine = dr.dot(normal, view)
     clipped = dr.clip(cosine, _MINIMUM_VIEW_COSINE, 1.0)
     roughness = mi.Float(roughness)
-    lobes = shaped_lobes(normal, view, roughness, tabulated_shape(clipped, roughness), clipped)
+    lobes = lobes_of_shape(normal, view, roughness, shape_from_tables(clipped, roughness), clipped)
     white, grazing = (
         dr.select(cosine > 0.0, amplitude, _DARK)
         for amplitude in (lobes.white_log_amplitude, lobes.grazing_log_amplitude)

@@ -20,7 +20,7 @@ from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import SdfField, signed_distance, surface
 from sira_mi.files import write_png
 from sira_mi.portrait.camera import yaw_rotation
-from sira_mi.sg.radiance import Material, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
 
@@ -180,7 +180,7 @@ class AppearancePicture:
                 shine = specular_albedo(specular, self.architecture.specular_octaves, x_ref)
                 views = mi.TensorXf(np.repeat(away[:, None], x_ref.shape[1], axis=1))
                 material = Material(albedo, shine, self.roughness, 1.0)
-                lit = [reflected_radiance(normals, views, material, light) for light in lights]
+                lit = [closed_form_radiance(normals, views, material, light) for light in lights]
                 return albedo, shine, *(a + b for a, b in lit)
 
             albedo, shine, *lit = evaluate_in_chunks(colors, *frozen)

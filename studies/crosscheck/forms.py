@@ -13,7 +13,7 @@ from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
 from sira_mi.plugins.sira_sg import rotation_of, unoccluded_directions
 from sira_mi.sg import brdf, shading, visibility
 from sira_mi.sg.lobes import lobe_count, unpack_lobe
-from sira_mi.sg.radiance import Material, reflect, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance, reflect
 from sira_mi.sg.sampling import LobeMixture
 from studies.crosscheck.points import Points
 from studies.stability import double
@@ -43,7 +43,7 @@ def closed_form(points: Points, lobes: np.ndarray, roughness: float, k_s: float)
 
     def columns(normal, view, diffuse, specular):
         material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
-        radiance = reflected_radiance(normal, -view, material, light)
+        radiance = closed_form_radiance(normal, -view, material, light)
         return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(columns, points.normal, points.view, points.diffuse, points.specular)[0]
@@ -68,7 +68,7 @@ def with_visibility(
         seen = visibility.light_visibility(normal, -view, specular, roughness, light, directions, unoccluded)
         seen = replace(seen, bounce_diffuse=seen.bounce_diffuse * factor, bounce_specular=seen.bounce_specular * factor)
         material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
-        radiance = reflected_radiance(normal, -view, material, light, seen)
+        radiance = closed_form_radiance(normal, -view, material, light, seen)
         return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(columns, points.x, points.normal, points.view, points.diffuse, points.specular)[0]
@@ -182,7 +182,7 @@ def direct_light(
         half = dr.normalize(dr.select(above, view + direction, normal))
         core = 0.25 * brdf.distribution(0.5 * dr.squared_norm(half - normal), rough)
         core *= brdf.masking(dr.maximum(cos_view, 0.0), rough) * brdf.masking(dr.maximum(cos_light, 0.0), rough)
-        density += dr.maximum(cos_light, 0.0) * dr.inv_pi + brdf.reflected_density(normal, view, direction, rough)
+        density += dr.maximum(cos_light, 0.0) * dr.inv_pi + brdf.reflection_density(normal, view, direction, rough)
         weight = dr.select(above, radiance * cos_light / dr.maximum(density, 1e-12), 0.0)
         return above, weight, core, brdf.fresnel_weight(dr.dot(view, half))
 

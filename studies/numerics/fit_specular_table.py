@@ -82,7 +82,7 @@ class Samples:
             per_cell = self.exact.shape[2]
             normal = double.Vector3f(0, 0, 1)
             spread = specular.LobeShape(**{k: double.Float(np.repeat(v, per_cell)) for k, v in shape.items()})
-            lobes = specular.shaped_lobes(normal, self.view, self.lane_roughness, spread, self.view.z)
+            lobes = specular.lobes_of_shape(normal, self.view, self.lane_roughness, spread, self.view.z)
             parts = specular.specular_integrals(lobes, self.axis, self.sharpness)
             dr.eval(parts)
             return np.stack([x.numpy() for x in parts]).reshape(self.exact.shape)

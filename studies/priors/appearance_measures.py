@@ -31,7 +31,7 @@ from sira_mi.optimisation.adam import adam, cosine_fall, parameter_values, take_
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.pictures import psnr
-from sira_mi.sg.radiance import Material, reflect, reflected_radiance
+from sira_mi.sg.radiance import Material, closed_form_radiance, reflect
 from sira_mi.sg.shading import shade
 from sira_mi.training import af_sm
 from sira_mi.training.prior import whitening
@@ -372,7 +372,7 @@ def _evenly_lit(fitted: Factors, normal: np.ndarray, view: np.ndarray, roughness
     lobes = mi.TensorXf(np.array([[0, 1, 0, 1e-3, 1, 1, 1]], np.float32))
 
     def evaluate(albedo, f0, normal, view):
-        radiance = reflected_radiance(normal, view, Material(albedo, f0, roughness, 1.0), lobes)
+        radiance = closed_form_radiance(normal, view, Material(albedo, f0, roughness, 1.0), lobes)
         return radiance.diffuse + radiance.specular
 
     return evaluate_in_chunks(evaluate, fitted.albedo, fitted.specular, normal, view)[0]
