@@ -54,7 +54,7 @@ def refine_albedo(base, refinement, k_r):
 
 
 def light_refinement(network: list[tuple], octaves: int, x_ref, gamma):
-    """Logarithm [3, N] of the factor by which more light than eq. 8 has it arrives in the photo, in [-4, 4]."""
+    """The logarithm [3, N], in [-4, 4], of the factor that the light in the photo has over that of eq. 8."""
     return 4.0 * dr.tanh(0.25 * evaluate(network, dr.concat([encode(x_ref, octaves), gamma], axis=0)))
 
 
@@ -75,8 +75,8 @@ def albedo_refinement_cooperative(packed, octaves: int, x_ref: list, gamma: list
 
 
 def illumination(network: list[tuple], latent):
-    """Illumination decoder: z_l [dim, S] -> lobes [N_l, 7, S] (axis, sharpness, RGB amplitude), offsets from evenly
-    spread lobes; sharpness and amplitude are bounded exponentials, so that no latent leads to an infinite light."""
+    """Illumination decoder: z_l [dim, S] -> lobes [N_l, 7, S] (axis, sharpness, RGB amplitude). The network moves axes
+    away from an even spread; sharpness and amplitude are exponentials of bounded numbers, so every light is finite."""
     h = evaluate(network, latent)
     count, scenes = h.shape[0] // 7, h.shape[1]
     h = dr.reshape(h, (count, 7, scenes))

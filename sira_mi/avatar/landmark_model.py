@@ -1,8 +1,8 @@
 """Landmarks of the SA-SM's heads.
 
-Points with the same place in reference space lie on the same part of a face, about: the deformation is learned with
-landmarks as one loss among many. What the places that it gives miss of a head's true landmarks is linear in those
-places themselves, by the principal directions that they vary in over the training's heads.
+A landmark has about the same place in reference space on every head, because the deformation is trained with a loss on
+landmarks. Mapping that place back into space gives a first estimate. A linear model, fitted to the training's heads in
+the principal directions of these estimates, corrects it.
 """
 
 import drjit as dr
@@ -19,7 +19,7 @@ _STEPS = 4
 
 
 def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
-    """Which landmarks [468] bool the mean head has, and the places [3, L] of those in reference space."""
+    """Which landmarks the mean head has, [468] bool, and where these L lie in reference space, [3, L]."""
     mean = prior.tensors["landmarks"]
     known = np.isfinite(mean).all(axis=1)
     field = HeadShape(prior.architecture).field(with_zero_latents(prior.tensors))
@@ -27,8 +27,8 @@ def reference_landmarks(prior: Avatar) -> tuple[np.ndarray, np.ndarray]:
 
 
 def place_landmarks(field: SdfField, x_ref, start):
-    """Where the field maps to landmarks' places x_ref [3, L] in reference space: tensor [3, L], found by fixed-point
-    steps from `start` [3, L]. Without gradients."""
+    """The points, a tensor [3, L], that the field maps to x_ref [3, L] in reference space, by fixed-point steps from
+    `start` [3, L]. Without gradients."""
     with dr.suspend_grad():
         x, x_ref = mi.TensorXf(start), mi.TensorXf(x_ref)
         for _ in range(_STEPS):
@@ -38,9 +38,9 @@ def place_landmarks(field: SdfField, x_ref, start):
 
 
 class LandmarkModel:
-    """True landmarks from placed ones: mean + (placed − mean placed) · directionsᵀ · offsets, of the tensors
-    `landmarks` [468, 3], `landmark_placed` [468, 3], `landmark_directions` [K, 468, 3] and `landmark_offsets`
-    [K, 468, 3] of a prior. A prior that lacks the last three takes places as they are."""
+    """Corrects the landmarks that `place_landmarks` finds: mean + (placed − mean placed) · directionsᵀ · offsets, with
+    the tensors `landmarks` [468, 3], `landmark_placed` [468, 3], `landmark_directions` [K, 468, 3] and
+    `landmark_offsets` [K, 468, 3] of a prior. Without the last three it changes nothing."""
 
     def __init__(self, prior: Avatar):
         tensors = prior.tensors
@@ -66,7 +66,7 @@ class LandmarkModel:
 
 
 def landmarks_of(prior: Avatar, field: SdfField) -> np.ndarray:
-    """The landmarks [468, 3] of a head of the prior by its field, without motion; NaN where unknown."""
+    """The landmarks [468, 3] of a head of the prior, given its field without motion; NaN where unknown."""
     known, x_ref = reference_landmarks(prior)
     start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
     landmarks = np.full((len(known), 3), np.nan, np.float32)

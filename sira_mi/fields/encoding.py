@@ -27,7 +27,7 @@ def encode(x, octaves: int):
 
 
 def encode_with_tangents(x, tangents: list, octaves: int):
-    """`encode`, with directional derivatives of x [3, N] carried along: (features, derivatives of the features)."""
+    """`encode` of x [3, N] and of directional derivatives of x: (features, derivatives of the features)."""
     if octaves == 0:
         return x, tangents
     frequencies = mi.TensorXf(_frequencies(octaves))

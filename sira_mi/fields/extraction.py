@@ -1,8 +1,8 @@
 """The zero level set of a signed distance field as a closed triangle mesh.
 
-The field is evaluated from a coarse grid down to a fine one, each level only where the one above it comes close to
-the surface; `extract_reference` evaluates the whole fine grid and serves the tests. Outside the domain box there is
-no solid: the mesh is closed flat along the box.
+The field is evaluated on a coarse grid, then on finer ones, each only where the previous one is close to the surface.
+`extract_reference` evaluates the whole fine grid, for tests. Outside the domain box there is no solid, so the mesh is
+closed flat along the box.
 """
 
 from collections.abc import Callable, Sequence

@@ -39,8 +39,8 @@ def on_ray(origin, direction, t):
 
 
 def newton_hits(field: SdfField, origin, direction, t, iterations: int = _ITERATIONS):
-    """Moves ray parameters t [1, N] onto the field's surface: Newton steps along the ray whose slope ∇f·v is taken
-    once, at the start, then improved by secants. `origin` and `direction` are [3, N].
+    """Moves ray parameters t [1, N] onto the field's surface by Newton steps along the ray. The slope ∇f·v is evaluated
+    once, at the start; secants improve it after that. `origin` and `direction` are [3, N].
 
     Returns (t [1, N], f at t [1, N]); rays whose |f| stays above `HIT_TOLERANCE` have no hit near their start.
     Without gradients."""
@@ -60,9 +60,8 @@ def newton_hits(field: SdfField, origin, direction, t, iterations: int = _ITERAT
 
 
 def first_crossings(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """For rays [3, N] that Newton steps did not bring onto the surface: the first change from outside to inside on even
-    samples from a little before t [1, N] to well behind it, as a linear estimate [1, N]; `_NO_CROSSING` where there is
-    none."""
+    """Where rays [3, N] first go from outside to inside near t [1, N]: ray parameters [1, N], interpolated linearly
+    between even samples that start a little before t and end well behind it; `_NO_CROSSING` where they do not."""
     at = t.T + np.float32(_SEARCH_START) + np.float32(_SEARCH_STEP) * np.arange(_SEARCH_SAMPLES, dtype=np.float32)
     f = np.empty_like(at)
     for first in range(0, len(at), _SEARCH_RAYS):
@@ -85,9 +84,9 @@ def with_unit_gradient(field: SdfField, length: float) -> SdfField:
 
 
 def refine_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: np.ndarray) -> list[np.ndarray]:
-    """The surface near the parameters t [1, N] of rays [3, N]: Newton steps; for rays that are not on it yet as many
-    again, as thin features need; for those still off it Newton steps from their first crossing near t. Returns t and f
-    [1, N] like `newton_hits`; a ray takes at most `MAXIMUM_EVALUATIONS`."""
+    """`newton_hits` of rays [3, N] from parameters t [1, N], with two more tries. Rays that miss take as many steps
+    again from where they are, which helps at thin features. Those that still miss start anew at their first crossing
+    near t. A ray evaluates the field at most `MAXIMUM_EVALUATIONS` times."""
 
     def newton(*columns):
         return evaluate_in_chunks(lambda o, d, t: newton_hits(field, o, d, t), *columns)
@@ -118,8 +117,8 @@ def bisection_hits_reference(field: SdfField, origin, direction, t_outside, t_in
 
 
 def differentiable_hit(field: SdfField, origin, direction, t):
-    """The hit o + t(θ) v with t(θ) = t₀ − (f(x₀; θ) − f(x₀; θ₀)) / (∇f·v) (IDR): the value [3, N] of the exact hit at t
-    [1, N], and the derivative of the level set by the field's parameters."""
+    """The exact hit [3, N] at ray parameters t [1, N], with its derivative in the field's parameters θ: o + t(θ) v,
+    t(θ) = t₀ − (f(x₀; θ) − f(x₀; θ₀)) / (∇f·v) (IDR, Yariv et al. 2020)."""
     x = on_ray(origin, direction, t)
     f, slope = signed_distance_and_slope(field, x, direction)
     slope = dr.detach(slope)

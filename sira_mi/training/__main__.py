@@ -33,11 +33,11 @@ def main() -> None:
     if (arguments.steps is not None and arguments.steps < 1) or arguments.picture_steps < 1:
         raise InputError("--steps and --picture-steps are at least 1")
 
-    import mitsuba as mi
+    from sira_mi.variants import set_variant
 
+    set_variant(arguments.variant)
     from sira_mi.training.train import parse_sizes, train_appearance, train_shape
 
-    mi.set_variant(arguments.variant)
     train = train_shape if arguments.model == "shape" else train_appearance
     train(
         arguments.collection,

@@ -1,7 +1,7 @@
 """AF-SM, the appearance factorization model: self-supervised auto-decoder training, eq. 10 (section 3.1.4).
 
-It sees the images and which region a point is of, never the true albedo. Points enter through the frozen deformation of
-a trained SA-SM."""
+It sees the images and the region of every point, never the true albedo. Points are mapped to reference space by the
+frozen deformation of a trained SA-SM."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NETWORKS = ("diffuse_albedo", "specular_albedo", "illumination")
 LATENTS = ("z_a", "z_s", "z_l")
 # Share of the learning rates that is left at the end.
 _LAST_RATE = 0.05
-# Observations within this distance of a landmark tell how bright the skin is in the photos, scene units.
+# Observations this near to a landmark of bare skin are taken as skin, scene units.
 _SKIN_RADIUS = 0.06
 
 
@@ -39,7 +39,7 @@ class AppearanceTraining:
     """Settings of the AF-SM training; λ as in eq. 10."""
 
     steps: int = 8000
-    scenes: int = 24  # scenes a step: more of them and fewer points, so that latents are visited often
+    scenes: int = 24  # scenes a step; many scenes with few points each update the latents often
     points: int = 128  # a scene and step
     frozen_points: int = 6000  # of each scene's points, drawn once, at which the frozen deformation is evaluated
     learning_rate: float = 2e-3  # of the networks; falls to a twentieth along a cosine
@@ -48,12 +48,11 @@ class AppearanceTraining:
     jitter: float = 0.015  # ε of L_Reg, scene units (NeRFactor 0.01 on another scale)
     embedding: float = 1e-4  # λ6, on ‖z‖²
     smoothness: float = 0.01  # λ7 (NeRFactor 0.05)
-    specular_anchor: float = 0.01  # pull of the log specular albedo to its region's level, which images hardly tell
+    specular_anchor: float = 0.01  # pulls the log specular albedo to its region's level; images constrain it little
     # Reflectance at normal incidence of skin (FLARE), hair, eyes and cloth (those of the collection).
     specular_levels: tuple[float, ...] = (SKIN_SPECULAR, 0.024, 0.07, 0.008)
-    white_light: float = 0.02  # pull of the light towards grey, which settles the colour of light against albedo
-    skin_tone: float = 1e-3  # on the deviations of a face's skin albedo from measured skin, which settles the
-    # level and colour of the light against the albedo's
+    white_light: float = 0.02  # pulls the light to grey, since images do not tell its colour from the albedo's
+    skin_tone: float = 1e-3  # pulls skin albedo to measured skin, since images do not tell its level from the light's
     skin_radiance: float = 0.286  # luminance of average skin in a photo: the geometric mean of the collection's photos
     skin_deviations: tuple[float, float] = (0.6, 0.08)  # of log skin albedo along and across the axis of skin tone:
     # half a stop from the tone that the photo's brightness tells, and Yun et al. 2010

@@ -27,9 +27,9 @@ _PICTURE_SHARE = 0.02  # of the training time that pictures may take
 
 
 class Divergence:
-    """The running median of a training's weighted loss, compared with the best that it has been.
+    """Compares the running median of a training's weighted loss with its best value so far.
 
-    The first window of steps only fills the median; after a resume it fills again, but the best is kept."""
+    The window of the median has to fill first, at the start and again after a resume; the best value survives that."""
 
     def __init__(self, best: float = math.inf):
         self.best = best

@@ -1,7 +1,7 @@
 """A trained SA-SM as a statistical model: its networks and the Gaussian of its latents.
 
-Every latent is z = mean + basis w with w ~ N(0, I), so that a vector w means the same for networks straight out of a
-training, whose latents have any mean and spread, and for a prior, whose latents are standard normal already.
+Every latent is z = mean + basis w with w ~ N(0, I). The same w therefore serves the networks of a training, whose
+latents have any mean and spread, and those of a prior, whose latents are standard normal.
 """
 
 from __future__ import annotations

@@ -9,14 +9,21 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.avatar.file import save_avatar
+from sira_mi.avatar.shape import head_of
 from sira_mi.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from sira_mi.avatar.architecture import AvatarArchitecture
+from sira_mi.optimisation.adam import adam
+from sira_mi.training import af_sm, sa_sm
+from sira_mi.training.loop import read_parameters, run_training
+from sira_mi.training.pictures import AppearancePicture, shape_picture
+from sira_mi.training.prior import assemble_prior
+from sira_mi.training.sa_sm import LATENTS, NETWORKS
+from sira_mi.training.scenes import load_training_scenes
+from sira_mi.training.shape_model import ShapeModel
 
 # The loss terms of each model whose weight λ is a setting of that name.
 SHAPE_TERMS = (
@@ -35,7 +42,6 @@ APPEARANCE_TERMS = ("embedding", "smoothness", "specular_anchor", "white_light",
 
 def parse_sizes(items: list[str]) -> dict[str, int]:
     """`["sdf_width=64", ...]` as sizes of an AvatarArchitecture. Raises InputError for anything else."""
-    from sira_mi.avatar.architecture import AvatarArchitecture
 
     names, sizes = [field.name for field in dataclasses.fields(AvatarArchitecture)], {}
     for item in items:
@@ -70,8 +76,6 @@ def without_term(settings, terms: tuple[str, ...], without: str | None):
 
 def read_architecture(metadata: dict[str, str], checkpoint: Path) -> AvatarArchitecture:
     """The architecture that a training's checkpoint holds. Raises InputError when there is none."""
-    from sira_mi.avatar.architecture import AvatarArchitecture
-
     try:
         return AvatarArchitecture.from_dict(json.loads(metadata["architecture"]), checkpoint)
     except (KeyError, TypeError, ValueError) as error:
@@ -100,16 +104,6 @@ def train_shape(
 ) -> dict[str, np.ndarray]:
     """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
     `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
-    import numpy as np
-
-    from sira_mi.avatar.architecture import AvatarArchitecture
-    from sira_mi.optimisation.adam import adam
-    from sira_mi.training import sa_sm
-    from sira_mi.training.loop import run_training
-    from sira_mi.training.pictures import shape_picture
-    from sira_mi.training.scenes import load_training_scenes
-    from sira_mi.training.shape_model import ShapeModel
-
     architecture = with_sizes(AvatarArchitecture(), sizes or {})
     settings = without_term(sa_sm.ShapeTraining(), SHAPE_TERMS, without)
     if steps is not None:
@@ -154,19 +148,6 @@ def train_appearance(
     """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`, whose architecture it takes over; writes
     `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only; `scenes` are the
     collection's if they are loaded already."""
-    import numpy as np
-
-    from sira_mi.avatar.file import save_avatar
-    from sira_mi.avatar.shape import head_of
-    from sira_mi.optimisation.adam import adam
-    from sira_mi.training import af_sm
-    from sira_mi.training.loop import read_parameters, run_training
-    from sira_mi.training.pictures import AppearancePicture
-    from sira_mi.training.prior import assemble_prior
-    from sira_mi.training.sa_sm import LATENTS, NETWORKS
-    from sira_mi.training.scenes import load_training_scenes
-    from sira_mi.training.shape_model import ShapeModel
-
     checkpoint = out / "shape.checkpoint"
     if not checkpoint.exists():
         raise InputError(f"{checkpoint} is missing; run python -m sira_mi.training shape first")
