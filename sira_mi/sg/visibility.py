@@ -14,6 +14,8 @@ light diffusely; this one bounce is kept apart, to be multiplied by the albedo o
 Which directions are unoccluded depends on the geometry alone: they are traced once and serve any light.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Any

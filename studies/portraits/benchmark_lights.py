@@ -39,7 +39,7 @@ def backdrop(light: str, random: np.random.Generator, image: np.ndarray, directi
     """The background [H, W, 3] in viewing directions [H, W, 3]: for `outdoor` the blurred environment `image`
     [h, 2h, 3] in its own scale, otherwise a grey wall that darkens towards the corners, in the photo's scale."""
     if light == "outdoor":
-        return look_up(blurred(image, SOFT), directions)
+        return look_up(blur(image, SOFT), directions)
     brightness = random.uniform(0.14, 0.45) if light == "studio" else random.uniform(0.04, 0.1)
     height, width = directions.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
@@ -48,7 +48,7 @@ def backdrop(light: str, random: np.random.Generator, image: np.ndarray, directi
     return brightness * fall[..., None] * _tint(random, 0.06)
 
 
-def blurred(image: np.ndarray, degrees: float) -> np.ndarray:
+def blur(image: np.ndarray, degrees: float) -> np.ndarray:
     """A map [H, 2H, 3] blurred by a Gaussian of that standard deviation on the equator, going round."""
     sigma = degrees * image.shape[0] / 180
     return gaussian_filter(image, (sigma, sigma, 0), mode=("nearest", "wrap", "nearest"))
