@@ -54,10 +54,15 @@ class Surface:
         return Surface(*(values[:, index] for values in columns))
 
 
-def _albedos(shape: NeuralSDF, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Diffuse [3, N] and specular albedo [1, N] by the networks."""
-    field, bsdf = shape.field(), cast("SiraBSDF", shape.bsdf())
-    textures = [cast("NeuralAlbedo", t) for t in (bsdf.diffuse_albedo, bsdf.specular_albedo)]
+def albedo_textures(shape: NeuralSDF) -> tuple[NeuralAlbedo, NeuralAlbedo]:
+    """The neural albedos of a head, diffuse and specular."""
+    bsdf = cast("SiraBSDF", shape.bsdf())
+    return cast("NeuralAlbedo", bsdf.diffuse_albedo), cast("NeuralAlbedo", bsdf.specular_albedo)
+
+
+def evaluate_albedos(shape: NeuralSDF, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Diffuse [3, N] and specular albedo [1, N] by the networks at points [3, N] of the field."""
+    field, textures = shape.field(), albedo_textures(shape)
 
     def columns(points):
         inputs = deform(field, points)
@@ -81,7 +86,7 @@ def sample_surface(shape: NeuralSDF) -> Surface:
     chosen = np.sort(rng.choice(vertices.shape[1], min(_POINTS, vertices.shape[1]), replace=False))
     x = vertices[:, chosen]
     normal = _normals(shape, x)
-    return Surface(x, normal, *_albedos(shape, x), _neighbours(shape, x, normal))
+    return Surface(x, normal, *evaluate_albedos(shape, x), _neighbours(shape, x, normal))
 
 
 def _neighbours(shape: NeuralSDF, x: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -198,7 +203,7 @@ def sharing_error(
     corners, centres = _random_triangles(shape)
     points = np.concatenate([centres, corners], axis=1)
     normal = _normals(shape, points)
-    everything = Surface(points, normal, *_albedos(shape, points), np.empty((0, points.shape[1]), int))
+    everything = Surface(points, normal, *evaluate_albedos(shape, points), np.empty((0, points.shape[1]), int))
     view, count = _view(everything, centre), centres.shape[1]
     middle, corner = np.repeat(np.arange(count), 3), count + np.arange(3 * count)
     used = (normal[:, middle] * normal[:, corner]).sum(axis=0) >= COSINE
@@ -218,7 +223,9 @@ def baking_error(shape: NeuralSDF) -> tuple[float, float]:
     corners, centres = _random_triangles(shape)
     diffuse, specular = (
         float(np.abs(at_corners.reshape(len(at_corners), -1, 3).mean(axis=2) - at_centres).max())
-        for at_corners, at_centres in zip(_albedos(shape, corners), _albedos(shape, centres), strict=True)
+        for at_corners, at_centres in zip(
+            evaluate_albedos(shape, corners), evaluate_albedos(shape, centres), strict=True
+        )
     )
     return diffuse, specular
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
 
 import mitsuba as mi
 import numpy as np
@@ -33,13 +34,13 @@ class Case:
     others: tuple = ()  # further shapes of the scene
     lobes: np.ndarray | None = None  # [N_l, 7] of the scene's own light, in world coordinates
 
-    def head(self, voxel: float, baked: bool = True) -> mi.Shape:
+    def head(self, voxel: float, baked: bool = True) -> NeuralSDF:
         """The head as a shape whose mesh has the spacing `voxel` (scene units), its albedos kept at the vertices or
         evaluated as networks at every hit."""
         description = scenes.head(self.avatar, voxel, baked, to_world=mi.ScalarTransform4f(self.to_world))
         bsdf = description["bsdf"]
         bsdf["roughness"], bsdf["k_s"] = self.roughness, self.k_s
-        return mi.load_dict(description)
+        return cast(NeuralSDF, mi.load_dict(description))
 
     def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:
         """The head under `lobes` [N_l, 7], or under an emitter's description instead; seen through independent samples,
@@ -47,7 +48,7 @@ class Case:
         light = light or {"type": "sg_envmap", "lobes": mi.TensorXf(np.ascontiguousarray(lobes, np.float32))}
         others = {f"other_{k}": shape for k, shape in enumerate(self.others)}
         sensor = {**self.sensor, "sampler": {"type": "stratified" if even else "independent"}}
-        return mi.load_dict({"type": "scene", "sensor": sensor, "head": head, "light": light, **others})
+        return cast(mi.Scene, mi.load_dict({"type": "scene", "sensor": sensor, "head": head, "light": light, **others}))
 
 
 def load_case(path: Path | None, size: int) -> Case:
@@ -112,7 +113,7 @@ def _sensor(path: Path, sensor: mi.Sensor, size: int) -> tuple[dict, int, int]:
         "near_clip": number["near_clip"],
         "far_clip": number["far_clip"],
         **offset,
-        "to_world": mi.ScalarTransform4f(np.array(params["to_world"].matrix.numpy(), np.float64).reshape(4, 4)),
+        "to_world": mi.ScalarTransform4f(np.array(params["to_world"].matrix.numpy()).reshape(4, 4).tolist()),
         "film": scenes.film(width, height),
     }
     return description, width, height

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 
+from sira_mi.plugins.neural_sdf import NeuralSDF
 from studies.crosscheck import forms
 from studies.crosscheck.case import Case
 from studies.crosscheck.images import Estimate, mean_square, resolution, root
@@ -52,7 +52,7 @@ class Row:
     resolution: float | None = None  # the error over the head that noise alone may show
 
 
-def gather(case: Case, reference: mi.Shape, usual: mi.Shape, side: int, seed: int) -> list[Half]:
+def gather(case: Case, reference: NeuralSDF, usual: NeuralSDF, side: int, seed: int) -> list[Half]:
     """Both halves, side² rays a pixel each. They serve every light."""
     halves = []
     for half in range(2):
@@ -82,7 +82,7 @@ class Pictures:
 
 
 def shade_halves(
-    case: Case, reference: mi.Shape, usual: mi.Shape, halves: list[Half], lobes: np.ndarray, samples: int, seed: int
+    case: Case, reference: NeuralSDF, usual: NeuralSDF, halves: list[Half], lobes: np.ndarray, samples: int, seed: int
 ) -> Pictures:
     """Every form at the points of both halves under `lobes` [N_l, 7]; `samples` of each kind for direct light."""
     scene, other = case.scene(reference, lobes), case.scene(usual, lobes)

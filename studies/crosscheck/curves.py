@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.plugins.neural_sdf import NeuralSDF
 from studies.crosscheck import forms
 from studies.crosscheck.case import Case
 from studies.crosscheck.images import (
@@ -86,7 +87,7 @@ def timed(function: Callable[[int], np.ndarray], repeats: int, warm: bool) -> tu
     return result, float(np.median(spent))
 
 
-def _closed_forms(case: Case, head: mi.Shape, lobes: np.ndarray, seed: int, log: LaunchLog) -> Iterator:
+def _closed_forms(case: Case, head: NeuralSDF, lobes: np.ndarray, seed: int, log: LaunchLog) -> Iterator:
     """(method, samples, function of the run's number that renders it)."""
     scene = case.scene(head, lobes, even=True)
     light = (forms.local_lobes(lobes, head), case.roughness, case.k_s)
@@ -110,7 +111,7 @@ def _closed_forms(case: Case, head: mi.Shape, lobes: np.ndarray, seed: int, log:
 
 def measure_curves(
     case: Case,
-    head: mi.Shape,
+    head: NeuralSDF,
     light: str,
     lobes: np.ndarray,
     reference: Estimate,

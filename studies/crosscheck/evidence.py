@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def load_or_measure(folder: Path | None, name: str, key: str, measure: Callable[
         folder.mkdir(parents=True, exist_ok=True)
         stored = {f"picture/{name}": picture for name, picture in lit.pictures.items()}
         stored |= {f"region/{name}": mask for name, mask in lit.regions.items()}
-        write_through(arrays, lambda file: np.savez_compressed(str(file), **stored))  # type: ignore[arg-type]
+        write_through(arrays, lambda file: np.savez_compressed(file, **cast(Any, stored)))
         return lit.figures
 
     figures = load_or_compute(folder / f"{stem}.json", key, compute, (arrays,))

@@ -3,13 +3,15 @@ and direct light by Monte Carlo, with shadows and without."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
+from sira_mi.plugins.neural_sdf import NeuralSDF
 from sira_mi.plugins.sira_sg import rotation_of, unoccluded_directions
 from sira_mi.sg import brdf, shading, visibility
 from sira_mi.sg.lobes import lobe_count, unpack_lobe
@@ -17,6 +19,9 @@ from sira_mi.sg.radiance import Material, closed_form_radiance, reflect
 from sira_mi.sg.sampling import LobeMixture
 from studies.crosscheck.points import Points
 from studies.stability import double
+
+# Arrays of Dr.Jit, whose stubs know neither their arithmetic between types nor symbolic loops.
+Array: TypeAlias = Any
 
 # The cosine as two Gaussians (Meder and Bruederlin 2018, as in PhySG): factor, sharpness, what is taken off.
 _COSINE = (32.7080, 0.0315, 31.7003)
@@ -26,14 +31,14 @@ _R2 = (0.7548776662466927, 0.5698402909980532)
 _DOUBLE_CHUNK = 1 << 15
 
 
-def local_lobes(lobes: np.ndarray, head: mi.Shape) -> np.ndarray:
+def local_lobes(lobes: np.ndarray, head: NeuralSDF) -> np.ndarray:
     """Lobes [N_l, 7] in world coordinates as the head's field sees them."""
     turned = np.array(lobes, np.float32)
     turned[:, :3] = turned[:, :3] @ rotation_of(head.to_world)
     return turned
 
 
-def _tensor(array) -> mi.TensorXf:
+def _tensor(array: np.ndarray) -> mi.TensorXf:
     return mi.TensorXf(np.ascontiguousarray(array, np.float32))
 
 
@@ -52,7 +57,7 @@ def closed_form(points: Points, lobes: np.ndarray, roughness: float, k_s: float)
 def with_visibility(
     points: Points,
     scene: mi.Scene,
-    head: mi.Shape,
+    head: NeuralSDF,
     lobes: np.ndarray,
     roughness: float,
     k_s: float,
@@ -65,8 +70,9 @@ def with_visibility(
 
     def columns(x, normal, view, diffuse, specular):
         unoccluded = unoccluded_directions(scene, head, x, normal, directions)
-        seen = visibility.light_visibility(normal, -view, specular, roughness, light, directions, unoccluded)
-        seen = replace(seen, bounce_diffuse=seen.bounce_diffuse * factor, bounce_specular=seen.bounce_specular * factor)
+        seen = visibility.light_visibility(normal, -view, specular, mi.Float(roughness), light, directions, unoccluded)
+        bounces: tuple[Array, Array] = seen.bounce_diffuse, seen.bounce_specular
+        seen = visibility.Visibility(seen.diffuse, seen.specular, *(factor * one for one in bounces))
         material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
         radiance = closed_form_radiance(normal, -view, material, light, seen)
         return radiance.diffuse + radiance.specular
@@ -100,17 +106,20 @@ def _physg_cosine_integral(normal, axis, sharpness):
 
 def physg(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np.ndarray:
     """Radiance [3, N] by PhySG's closed form (Zhang et al. 2021), its two-term cosine included, negative light cut."""
-    light = _tensor(lobes)
+    light, rough = _tensor(lobes), mi.Float(roughness)
 
     def columns(normal, view, diffuse, specular):
         n, v, s = from_columns(normal, mi.Vector3f), from_columns(view, mi.Vector3f), from_columns(specular, mi.Float)
-        warped_axis, warped_sharpness, warped_amplitude = shading.specular_lobe(n, v, roughness)
-        cosine = dr.dot(n, v)
-        safe = dr.maximum(cosine, 1e-3)
-        moment = 0.25 * warped_amplitude * dr.square(brdf.masking(safe, roughness)) * brdf.fresnel(s, safe)
-        irradiance, glossy = mi.Color3f(0.0), mi.Color3f(0.0)
+        warped: tuple[Array, ...] = shading.specular_lobe(n, v, rough)
+        warped_axis, warped_sharpness, warped_amplitude = warped
+        cosine: Array = dr.dot(n, v)
+        safe: Array = dr.maximum(cosine, 1e-3)
+        moment = 0.25 * warped_amplitude * dr.square(brdf.masking(safe, rough)) * brdf.fresnel(s, safe)
+        irradiance: Array = mi.Color3f(0.0)
+        glossy: Array = mi.Color3f(0.0)
         for index in range(lobe_count(light)):
-            axis, sharpness, amplitude = unpack_lobe(light.array, index)
+            lobe: tuple[Array, ...] = unpack_lobe(light.array, index)
+            axis, sharpness, amplitude = lobe
             irradiance += amplitude * _physg_cosine_integral(n, axis, sharpness)
             joint = warped_sharpness * warped_axis + sharpness * axis
             length = dr.norm(joint)
@@ -158,21 +167,24 @@ class Transport:
 
 
 def direct_light(
-    points: Points, scene: mi.Scene, head: mi.Shape, lobes: np.ndarray, roughness: float, samples: int, seed: int
+    points: Points, scene: mi.Scene, head: NeuralSDF, lobes: np.ndarray, roughness: float, samples: int, seed: int
 ) -> tuple[Transport, Transport]:
     """Direct light by Monte Carlo with the BRDF itself: (without shadows, with them), from the same directions.
 
     `samples` directions each are drawn from the light, the cosine and the normal distribution (balance heuristic); even
     sequences, shifted at random for every ray of the picture."""
-    mixture = LobeMixture(_tensor(lobes))
-    normal, facing, view = (mi.Vector3f(_rows(a)) for a in (points.normal, points.facing, points.view))
+    mixture: Array = LobeMixture(_tensor(lobes))
+    directions: tuple[Array, ...] = tuple(mi.Vector3f(_rows(a)) for a in (points.normal, points.facing, points.view))
+    normal, facing, view = directions
     x, count = mi.Point3f(_rows(points.x)), points.x.shape[1]
-    key = mi.UInt32(points.ray.astype(np.uint32))
-    first, second = mi.sample_tea_32(key, mi.UInt32(seed & 0xFFFFFFFF))
+    key: Array = mi.UInt32(points.ray.astype(np.uint32))
+    stream: Array = mi.UInt32(seed & 0xFFFFFFFF)
+    first, second = mi.sample_tea_32(key, stream)
     shift = mi.Point2f(mi.Float(first), mi.Float(second)) * 2.0**-32
-    frame, cos_view = mi.Frame3f(normal), dr.dot(normal, view)
+    frame: Array = mi.Frame3f(normal)
+    cos_view: Array = dr.dot(normal, view)
     visible = cos_view > 0.0
-    rough = mi.Float(roughness)
+    rough: Array = mi.Float(roughness)
 
     def weigh(direction):
         """What a direction adds: irradiance, white and grazing specular radiance, before its density."""
@@ -187,7 +199,8 @@ def direct_light(
         return above, weight, core, brdf.fresnel_weight(dr.dot(view, half))
 
     def body(index, *sums):
-        base = shift + mi.Float(index) * mi.Point2f(*_R2)
+        step: Array = mi.Float(index)
+        base = shift + step * mi.Point2f(*_R2)
         for k in range(3):
             u = base + k / 3.0
             u -= dr.floor(u)
@@ -208,8 +221,9 @@ def direct_light(
         return index + 1, *sums
 
     with dr.suspend_grad():
-        state = (dr.zeros(mi.UInt32, count), *(dr.zeros(mi.Color3f, count) for _ in range(6)))
-        sums = dr.while_loop(state, lambda index, *_: index < samples, body, mode="symbolic")[1:]
+        state: Array = (dr.zeros(mi.UInt32, count), *(dr.zeros(mi.Color3f, count) for _ in range(6)))
+        loop: Array = body
+        sums: Array = dr.while_loop(state, lambda index, *_: index < samples, loop, mode="symbolic")[1:]
         arrays = [part.numpy() / samples for part in sums]
     return Transport(*arrays[:3]), Transport(*arrays[3:])
 

@@ -65,7 +65,8 @@ def render(
     for k, start in enumerate(range(0, samples, most)):
         count = min(most, samples - start)
         for attempt in range(_MOST_TRIES):
-            image = mi.render(scene, integrator=integrator, spp=count, seed=pass_seed(*seed, k, attempt)).numpy()
+            key = mi.UInt32(pass_seed(*seed, k, attempt))
+            image = mi.render(scene, integrator=integrator, spp=count, seed=key).numpy()
             log.launches += 1
             if np.isfinite(image).all():
                 break
@@ -89,7 +90,8 @@ def converge(
     mean square over `mask` [H, W], is below `bound` as a share of `scale` (default: the mean over the mask), or until
     `seconds` are over. There are at least 8 passes, an even number."""
     start = time.monotonic()
-    sums, squares = [0.0, 0.0], 0.0
+    sums: list[np.ndarray] = [np.zeros(1), np.zeros(1)]
+    squares: np.ndarray = np.zeros(1)
     for k in itertools.count():
         image = np.asarray(render_pass(k), np.float64)
         sums[k % 2] = sums[k % 2] + image

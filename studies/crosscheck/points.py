@@ -4,16 +4,18 @@ and direct light are then evaluated at the same points, and differ by nothing el
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from sira_mi.fields.columns import evaluate_in_chunks, gather_columns, normalise
-from sira_mi.fields.sdf import deform, surface
+from sira_mi.fields.sdf import surface
 from sira_mi.fields.tracing import on_ray
-from sira_mi.plugins.neural_sdf import trace_head
+from sira_mi.plugins.neural_sdf import NeuralSDF, trace_head
 from sira_mi.plugins.sira_sg import rotation_of, scale_of
+from sira_mi.relight.surface import albedo_textures, evaluate_albedos
 from sira_mi.sg.visibility import SHADOW_OFFSET
 from studies.crosscheck.case import Case
 from studies.stability.fields64 import Field64
@@ -64,61 +66,71 @@ def primary_rays(case: Case, scene: mi.Scene, side: int, seed: int) -> mi.Ray3f:
     return mi.Ray3f(ray)
 
 
-def field_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: int) -> Points:
+def field_points(case: Case, scene: mi.Scene, head: NeuralSDF, side: int, seed: int) -> Points:
     """The exact hits on the field, as `sira_sg` finds them."""
     ray = primary_rays(case, scene, side, seed)
     t, hit = trace_head(scene, head, ray, mi.Bool(True))
-    index = dr.compress(hit)
+    index: Any = dr.compress(hit)
     local = head.to_local @ ray
     origin, direction, parameter = (gather_columns(v, index) for v in (local.o, local.d, t))
     x = on_ray(origin, direction, parameter).numpy()
-    field, bsdf = head.field(), head.bsdf()
+    field, textures = head.field(), albedo_textures(head)
 
     def columns(x, direction):
         _, gradient, x_ref, gamma = surface(field, x)
-        albedos = (texture.evaluate_columns(x_ref, gamma) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo))
+        albedos = (texture.evaluate_columns(x_ref, gamma) for texture in textures)
         return (normalise(gradient), -normalise(direction), *albedos)
 
     normal, view, diffuse, specular = evaluate_in_chunks(columns, x, direction.numpy())
     lift = SHADOW_OFFSET * head.voxel * scale_of(head.to_world)
     return Points(
-        (case.height, case.width), side * side, index.numpy(), x, normal, normal, view, diffuse, specular, None, None,
-        lift, lift,
-    )  # fmt: skip
+        shape=(case.height, case.width),
+        samples=side * side,
+        ray=index.numpy(),
+        x=x,
+        normal=normal,
+        facing=normal,
+        view=view,
+        diffuse=diffuse,
+        specular=specular,
+        baked_diffuse=None,
+        baked_specular=None,
+        lift=lift,
+        advance=lift,
+    )
 
 
-def mesh_points(case: Case, scene: mi.Scene, head: mi.Shape, side: int, seed: int) -> Points:
+def mesh_points(case: Case, scene: mi.Scene, head: NeuralSDF, side: int, seed: int) -> Points:
     """The hits on the mesh with its interpolated normals, as Mitsuba's integrators find them."""
     ray = primary_rays(case, scene, side, seed)
     si = scene.ray_intersect(ray)
-    baked = head.bsdf()
-    diffuse, specular = baked.diffuse_albedo.eval_3(si), baked.specular_albedo.eval_1(si)
+    diffuse_texture, specular_texture = albedo_textures(head)
+    baked_diffuse, baked_specular = diffuse_texture.eval_3(si), specular_texture.eval_1(si)
     hit = si.is_valid() & (si.shape == mi.ShapePtr(head))
-    dr.eval(si, hit, diffuse, specular)
-    index = dr.compress(hit)
+    dr.eval(si, hit, baked_diffuse, baked_specular)
+    index: Any = dr.compress(hit)
     inverse = rotation_of(head.to_world).T
-
-    def at(vector) -> np.ndarray:
-        return gather_columns(vector, index).numpy()
-
-    x = at(head.to_local @ si.p)
-    field, bsdf = head.field(), head.bsdf()
-
-    def columns(x):
-        x_ref, gamma = deform(field, x)
-        return tuple(texture.evaluate_columns(x_ref, gamma) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo))
-
-    looked_up = at(diffuse), at(specular)
-    albedos = evaluate_in_chunks(columns, x)
-    normal, facing, view = (inverse @ at(v) for v in (si.sh_frame.n, si.n, -ray.d))
-    lift = float(mi.math.RayEpsilon) * (1 + float(np.abs(x).max()))
+    x = gather_columns(head.to_local @ si.p, index).numpy()
+    diffuse, specular = evaluate_albedos(head, x)
+    normal, facing, view = (inverse @ gather_columns(v, index).numpy() for v in (si.sh_frame.n, si.n, -ray.d))
     return Points(
-        (case.height, case.width), side * side, index.numpy(), x, normal, facing, view, *albedos,
-        *looked_up, lift, 0.0,
-    )  # fmt: skip
+        shape=(case.height, case.width),
+        samples=side * side,
+        ray=index.numpy(),
+        x=x,
+        normal=normal,
+        facing=facing,
+        view=view,
+        diffuse=diffuse,
+        specular=specular,
+        baked_diffuse=gather_columns(baked_diffuse, index).numpy(),
+        baked_specular=gather_columns(baked_specular, index).numpy(),
+        lift=float(mi.math.RayEpsilon) * (1 + float(np.abs(x).max())),
+        advance=0.0,
+    )
 
 
-def in_double(points: Points, head: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+def in_double(points: Points, head: NeuralSDF) -> tuple[np.ndarray, np.ndarray]:
     """Points of the field [3, N] and their unit normals, both in float64: one more Newton step from the hits in single
     precision, along the rays."""
     field = Field64.of(head.field())

@@ -12,6 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.plugins.neural_sdf import NeuralSDF
 from studies.crosscheck import causes, curves, speed
 from studies.crosscheck.case import Case
 from studies.crosscheck.evidence import Lit, key_of, load_or_measure
@@ -62,7 +63,7 @@ def measure(
     head = functools.cache(case.head)
 
     @functools.cache
-    def gather() -> tuple[mi.Shape, mi.Shape, list[causes.Half]]:
+    def gather() -> tuple[NeuralSDF, NeuralSDF, list[causes.Half]]:
         heads = head(settings.voxel), head(settings.usual_voxel)
         halves = causes.gather(case, *heads, settings.side, settings.seed)
         say(f"heads and points after {time.monotonic() - start:.0f} s")
@@ -104,8 +105,8 @@ def measure(
 
 def _measure_light(
     case: Case,
-    head: mi.Shape,
-    usual: mi.Shape,
+    head: NeuralSDF,
+    usual: NeuralSDF,
     halves: list[causes.Half],
     name: str,
     lobes: np.ndarray,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from sira_mi.conventions import LANDMARKS
 from sira_mi.export import scene as scenes
 from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fields.sdf import sphere_parameters
-from sira_mi.plugins.neural_sdf import trace_head
+from sira_mi.plugins.neural_sdf import NeuralSDF, trace_head
 from sira_mi.sg.lobes import evaluate_lobes
 from sira_mi.sg.shading import shade
 from studies.crosscheck.case import Case
@@ -63,7 +64,7 @@ class Cost:
     seconds: float
 
 
-def interleaved(functions: dict[str, Callable[[], object]], repeats: int = _REPEATS) -> dict[str, float]:
+def interleave(functions: dict[str, Callable[[], object]], repeats: int = _REPEATS) -> dict[str, float]:
     """Median wall time of each function, after one run of each; they take turns, so that other work on the machine
     meets all alike."""
     spent: dict[str, list[float]] = {name: [] for name in functions}
@@ -76,7 +77,7 @@ def interleaved(functions: dict[str, Callable[[], object]], repeats: int = _REPE
     return {name: float(np.median(times)) for name, times in spent.items()}
 
 
-def stock_mesh(head: mi.Shape, bsdf: dict) -> mi.Mesh:
+def stock_mesh(head: NeuralSDF, bsdf: dict) -> mi.Mesh:
     """The head's mesh as Mitsuba's own, with texture coordinates from the front and its baked albedo as an attribute,
     under a stock BSDF."""
     params = mi.traverse(head)
@@ -85,7 +86,7 @@ def stock_mesh(head: mi.Shape, bsdf: dict) -> mi.Mesh:
     props["mesh_bsdf"] = mi.load_dict(bsdf)
     count = len(vertices) // 3
     mesh = mi.Mesh("stock", count, len(faces) // 3, props=props, has_vertex_normals=True, has_vertex_texcoords=True)
-    mesh.add_attribute("vertex_albedo", 3, np.array(params["vertex_diffuse_albedo"]))
+    mesh.add_attribute("vertex_albedo", 3, np.array(params["vertex_diffuse_albedo"]).tolist())
     own = mi.traverse(mesh)
     positions = np.array(vertices).reshape(-1, 3)
     span = np.ptp(positions[:, :2], axis=0)
@@ -120,7 +121,7 @@ def _environment(lobes: np.ndarray) -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap(image)}
 
 
-def texture_ratios(case: Case, usual: mi.Shape, lobes: np.ndarray, samples: int) -> list[Ratio]:
+def texture_ratios(case: Case, usual: NeuralSDF, lobes: np.ndarray, samples: int) -> list[Ratio]:
     """Path tracing with neural and baked albedos against stock BSDFs on the same mesh, under the same light."""
     integrator = path()
     shapes = {"baked": usual}
@@ -129,33 +130,33 @@ def texture_ratios(case: Case, usual: mi.Shape, lobes: np.ndarray, samples: int)
     runs = {name: case.scene(shape, lobes) for name, shape in shapes.items()}
     runs["baked, envmap"] = case.scene(usual, lobes, _environment(lobes))
     runs["attribute principled, envmap"] = case.scene(shapes["attribute principled"], lobes, _environment(lobes))
-    times = interleaved({k: lambda s=s: render(s, integrator, samples, 5) for k, s in runs.items()})
+    seconds = interleave({k: functools.partial(render, s, integrator, samples, 5) for k, s in runs.items()})
     # Networks take long: few samples have to do. Stock Mitsuba's turn is before there is a head with networks, because
     # the kernels of every picture hold those of all heads that are alive.
-    few = {}
+    few: dict[str, float] = {}
     for name, shape in (
         ("stock", lambda: shapes["bitmap principled"]),
         ("neural", lambda: case.head(usual.voxel, False)),
     ):
         scene = case.scene(shape(), lobes)
-        few |= interleaved({name: lambda scene=scene: render(scene, integrator, _NEURAL_SAMPLES, 5)}, 3)
+        few |= interleave({name: functools.partial(render, scene, integrator, _NEURAL_SAMPLES, 5)}, 3)
 
-    def ratio(name, first, second, mark=None):
-        return Ratio(*name, times[first] / times[second], times[first], mark)
+    def ratio(name: str, over: str, first: str, second: str, mark: float | None = None) -> Ratio:
+        return Ratio(name, over, seconds[first] / seconds[second], seconds[first], mark)
 
     first = "`path`, `sira_bsdf` with neural textures"
     baked = "`path`, `sira_bsdf` with baked textures"
     return [
         Ratio(first, "`principled`, bitmap", few["neural"] / few["stock"], few["neural"], 3.0),
-        ratio((baked, "`principled`, vertex attribute"), "baked", "attribute principled", 1.1),
-        ratio((baked, "`roughplastic`, bitmap"), "baked", "bitmap roughplastic"),
-        ratio((baked, "`principled`, bitmap"), "baked", "bitmap principled"),
-        ratio((f"{baked}, `envmap`", "`principled`, `envmap`"), "baked, envmap", "attribute principled, envmap"),
-        ratio((baked + ", `sg_envmap`", "the same, `envmap`"), "baked", "baked, envmap"),
+        ratio(baked, "`principled`, vertex attribute", "baked", "attribute principled", 1.1),
+        ratio(baked, "`roughplastic`, bitmap", "baked", "bitmap roughplastic"),
+        ratio(baked, "`principled`, bitmap", "baked", "bitmap principled"),
+        ratio(f"{baked}, `envmap`", "`principled`, `envmap`", "baked, envmap", "attribute principled, envmap"),
+        ratio(baked + ", `sg_envmap`", "the same, `envmap`", "baked", "baked, envmap"),
     ]
 
 
-def hit_ratio(case: Case, head: mi.Shape, side: int) -> Ratio:
+def hit_ratio(case: Case, head: NeuralSDF, side: int) -> Ratio:
     """Exact primary hits on the field against Embree's on the mesh."""
     scene = case.scene(head, np.array([[0, 0, 1, 1, 1, 1, 1]], np.float32))
     rays = [primary_rays(case, scene, side, seed) for seed in range(2)]
@@ -171,20 +172,20 @@ def hit_ratio(case: Case, head: mi.Shape, side: int) -> Ratio:
         dr.sync_thread()
 
     exact()
-    times = interleaved({"exact": exact, "mesh": mesh})
+    times = interleave({"exact": exact, "mesh": mesh})
     return Ratio(
         "primary hits refined on the field", "Embree's on the mesh", times["exact"] / times["mesh"], times["exact"]
     )
 
 
-def compilation_ratio(case: Case, head: mi.Shape, lobes: np.ndarray) -> Ratio:
+def compilation_ratio(case: Case, head: NeuralSDF, lobes: np.ndarray) -> Ratio:
     """Pictures by `sira_sg` of ever new rays, whose number of hits is new and asks for new kernels, against pictures of
     the same two sets of rays in turns. Kernels outlive the process, so the new seeds are taken from the clock."""
     scene, plugin = case.scene(head, lobes), mi.load_dict({"type": "sira_sg", "hide_emitters": True})
     turns = itertools.cycle((1, 2))
     for _ in range(2):
         render(scene, plugin, 1, next(turns))
-    times = interleaved(
+    times = interleave(
         {
             "new": lambda: render(scene, plugin, 1, time.time_ns()),
             "first": lambda: render(scene, plugin, 1, next(turns)),
@@ -213,13 +214,13 @@ def shading_costs(repeats: int = _REPEATS) -> list[Cost]:
             normal, view = rng.standard_normal((2, 3, count))
             normal, view = (a / np.linalg.norm(a, axis=0) for a in (normal, view))
             view *= np.sign((normal * view).sum(axis=0))
-            inputs = mi.Vector3f(normal.astype(np.float32)), mi.Vector3f(view.astype(np.float32)), mi.Float(0.04)
+            n, v = mi.Vector3f(normal.astype(np.float32)), mi.Vector3f(view.astype(np.float32))
 
-            def run(inputs=inputs, tensor=tensor):
-                dr.eval(shade(*inputs, mi.Float(0.5), tensor))
+            def run(n: mi.Vector3f = n, v: mi.Vector3f = v, tensor: mi.TensorXf = tensor) -> None:
+                dr.eval(shade(n, v, mi.Float(0.04), mi.Float(0.5), tensor))
                 dr.sync_thread()
 
-            result.append(Cost("shade", lobes, count, 0, interleaved({"shade": run}, repeats)["shade"]))
+            result.append(Cost("shade", lobes, count, 0, interleave({"shade": run}, repeats)["shade"]))
     return result
 
 
@@ -246,10 +247,14 @@ def width_costs(case: Case, lobes: np.ndarray, widths: tuple[int, ...] = WIDTHS,
             save_avatar(file, random_avatar(width))
             head = scenes.head(file, voxel)
             scene = case.scene(mi.load_dict(head), lobes)
-            layers = mi.render(scene, integrator=plugin, spp=1, seed=0).numpy()
+            layers = mi.render(scene, integrator=plugin, spp=1, seed=mi.UInt32(0)).numpy()
             turns = itertools.cycle((1, 2))
             render(scene, plugin, 1, next(turns))
-            spent = interleaved({"sira_sg": lambda s=scene, k=turns: render(s, plugin, 1, next(k))})["sira_sg"]
+
+            def run(scene: mi.Scene = scene, turns: Iterator[int] = turns) -> None:
+                render(scene, plugin, 1, next(turns))
+
+            spent = interleave({"sira_sg": run})["sira_sg"]
             result.append(Cost("sira_sg", len(lobes), int((layers[..., -1] > 0.5).sum()), width, spent))
     return result
 
