@@ -1,7 +1,7 @@
-"""The Mitsuba plugins, one file each; importing this package registers them for every variant set now or later.
+"""The Mitsuba plugins, one file each. Importing this package registers them for every variant that is set now or later.
 
-A plugin class derives from classes of the current variant (`mi.Mesh`, `mi.BSDF`, ...), so each plugin module is
-executed again whenever a variant is set, as Mitsuba does with its own Python integrators.
+A plugin derives from classes of the current variant (`mi.Mesh`, `mi.BSDF`, ...), so its module is executed again
+whenever a variant is set, as Mitsuba does with its own Python integrators.
 """
 
 import importlib

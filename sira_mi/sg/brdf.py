@@ -1,8 +1,8 @@
-"""The reflectance of eq. 8, f = a/π + k_s f^s, as pure functions of cosines: PhySG's simplified Disney BRDF.
+"""The reflectance of eq. 8, f = a/π + k_s f^s, as functions of cosines: PhySG's simplified Disney BRDF.
 
 f^s = D F G / (4 (n·l)(n·v)) with D = exp(2/r⁴ (h·n − 1)) / (πr⁴), F = s + (1 − s) 2^{−(5.55473 v·h + 6.8316) v·h} and
-Schlick-Smith's G = g(n·l) g(n·v) with g(c) = c / (c(1 − k) + k), k = (r + 1)²/8. The two cosines of G cancel those of
-the denominator, so f^s is finite at grazing angles. r is the roughness, s the monochrome specular albedo.
+Schlick-Smith's G = g(n·l) g(n·v), g(c) = c / (c(1 − k) + k), k = (r + 1)²/8. The cosines of G cancel those of the
+denominator, so f^s is finite at grazing angles. r is the roughness, s the monochrome specular albedo.
 """
 
 import math
@@ -22,7 +22,7 @@ def distribution_sharpness(roughness: Float) -> Float:
 
 
 def distribution(one_minus_cosine: Float, roughness: Float) -> Float:
-    """D(h) per steradian as a function of 1 − h·n, which the caller has without cancellation as ½|h − n|²."""
+    """D(h) per steradian as a function of 1 − h·n, which callers compute without cancellation as ½|h − n|²."""
     sharpness = distribution_sharpness(roughness)
     return sharpness * (0.5 / math.pi) * dr.exp(-sharpness * one_minus_cosine)
 
@@ -43,7 +43,7 @@ def fresnel(specular_albedo: Float, cosine: Float) -> Float:
 
 
 def masking(cosine: Float, roughness: Float) -> Float:
-    """g(c)/c = 1 / (c(1 − k) + k) with k = (r + 1)²/8; the G of one direction over its cosine."""
+    """g(c)/c = 1 / (c(1 − k) + k) with k = (r + 1)²/8: the masking of one direction over its cosine."""
     k = dr.square(roughness + 1.0) / 8.0
     return dr.rcp(dr.fma(cosine, 1.0 - k, k))
 

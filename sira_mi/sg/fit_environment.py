@@ -1,11 +1,11 @@
-"""Fits spherical-Gaussian lobes to a latitude-longitude environment, keeping its total light.
+"""Fits spherical-Gaussian lobes to a latitude-longitude environment and keeps its total light.
 
-Compact sources far brighter than their surroundings ("suns") are taken out first, one lobe each, by their flux and
-their first moment at full resolution. The rest is reduced to at most 32 rows; axes and sharpnesses start from a
-spherical k-means of the radiance, amplitudes from non-negative least squares, and Adam refines all of them on the
-squared error, weighted by solid angle over the root of the radiance: midway between what irradiance needs (absolute
-error) and what reflections show (relative error). At last the amplitudes are solved again and each channel is scaled
-to its flux.
+Compact sources that are far brighter than the rest ("suns") are removed first, each as one lobe with its flux and its
+mean direction at full resolution. The rest is reduced to at most 32 rows. Spherical k-means of the radiance gives
+initial axes and sharpnesses, non-negative least squares the amplitudes. Adam then refines all of them on the squared
+error, weighted by solid angle over the root of the radiance: a compromise between absolute error, which matters for
+irradiance, and relative error, which matters for reflections. Finally the amplitudes are solved again, and each channel
+is scaled to its flux.
 """
 
 from dataclasses import dataclass

@@ -1,16 +1,16 @@
 """Integrals of spherical Gaussians in closed form, stable in single precision for sharpness from 0 to 1e7.
 
-Exact: the integral over the sphere, the product of two lobes (again a lobe) and their inner product. The integrals over
-a hemisphere, plain and cosine-weighted, have no elementary form. Here they are those of a normal distribution: for a
-direction ω drawn from the lobe, ω·n has the exactly known mean m = A(λ) ξ·n, and with a standard deviation s
+The integral over the sphere, the product of two lobes (again a lobe) and their inner product are exact. The integrals
+over a hemisphere, plain and cosine-weighted, have no elementary form. They are approximated by a normal distribution:
+for a direction ω drawn from the lobe, ω·n has the known mean m = A(λ) ξ·n, and with a standard deviation s
 
     ∫ G (ω·n)₊ dω = (m Φ(m/s) + s φ(m/s)) ∫ G dω        (within 4e-4 of the value at ξ = n)
     ∫ G [ω·n > 0] dω = Φ(t) ∫ G dω                      (within 5e-4 of the whole)
 
-Every s makes the first form positive, and exact in the sum over the two sides of a plane up to its even part; s(λ, ξ·n)
-and t(λ, ξ·n) are close to the planar limit, and small polynomials fitted to quadrature supply the rest. The idea of
-a smooth, normalised step between the two exact ends is that of Meder & Brüderlin, "Hemispherical Gaussians for
-Accurate Light Integration" (2018); forms and coefficients are this project's own. All functions are elementwise.
+The first form is positive for every s, and its difference between the two sides of a plane, m ∫ G dω, is exact.
+s(λ, ξ·n) and t(λ, ξ·n) are the planar limits times small polynomials fitted to quadrature. The idea of a smooth,
+normalised step between the exact ends is from Meder & Brüderlin, "Hemispherical Gaussians for Accurate Light
+Integration" (2018); forms and coefficients are new. All functions are elementwise.
 """
 
 import math

@@ -70,8 +70,8 @@ def closed_form_radiance(
 def radiance_of_scenes(
     normals: TensorXf, views: TensorXf, material: Material, lobes: TensorXf, scenes: int
 ) -> Radiance:
-    """`closed_form_radiance` without visibility at the points of `scenes` S scenes in one launch: each scene's points
-    are consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
+    """`closed_form_radiance` of `scenes` S scenes in one launch, without visibility. Each scene's points are
+    consecutive and under its own light, `lobes` [N_l, 7, S]. Normals and views are constants, the roughness a number;
     differentiable in albedos and lobes."""
     point = _shading_points(normals, views, material)
     irradiance, specular = map(to_columns, shade_scenes(*point, material.roughness, lobes, scenes))

@@ -1,6 +1,6 @@
 """Sampling directions from a mixture of spherical Gaussians in proportion to the lobes' energy.
 
-A normalised lobe is a von Mises-Fisher density; its cosine has an invertible distribution, so that sampling is exact:
+A normalised lobe is a von Mises-Fisher density, whose cosine can be sampled exactly by inversion:
 1 − cos θ = −log(1 − u + u e^{−2λ})/λ. All steps are stable in single precision for sharpness from 0 to 1e7.
 """
 
@@ -59,9 +59,9 @@ def _sum_lobes(direction, packed, density, count):
 class _EvaluateMixture(dr.CustomOp):
     """`_sum_lobes` of a `LobeMixture`, differentiated in reverse by a second loop over the lobes.
 
-    Dr.Jit cannot reverse a loop inside the virtual function calls through which integrators reach an emitter. The
-    second loop sends each lobe's derivative through its own gather, straight into the gradient of the lobes. The
-    argument `anchor`, a value gathered from the lobes, only makes the result depend on them."""
+    Dr.Jit cannot reverse a loop inside the virtual calls through which integrators reach an emitter. The second loop
+    backpropagates through each lobe's gather into the gradient of the lobes. The argument `anchor`, gathered from the
+    lobes, only makes the result depend on them."""
 
     def eval(self, direction, anchor, mixture):
         self.direction, self.mixture = direction, mixture

@@ -1,7 +1,7 @@
-"""Closed-form shading (eq. 8) of many points under many lights at once, as trainings need it.
+"""Closed-form shading of many points under many lights at once, for training.
 
-`sg.shading.shade` serves one light and is differentiable in the points too; here each scene of a batch has its own
-light and the points are constants, which takes one launch for all scenes and an adjoint without atomics."""
+`sg.shading.shade` serves one light and is differentiable in the points. Here each scene of a batch has its own light
+and the points are constants: one launch for all scenes, and an adjoint without atomics."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,8 +1,8 @@
-"""Closed-form eq. 8: what a surface point reflects of an environment of spherical Gaussians, without shadows.
+"""The integrals of eq. 8 in closed form under an environment of spherical Gaussians, without shadows.
 
-Diffuse radiance is albedo/π times the irradiance; specular radiance is the integral of light × f^s × (n·ω)₊ with f^s of
-`brdf.py`, by the lobes of `specular.py`. `specular_lobe` and `specular_radiance_physg` are PhySG's warped distribution
-and its closed form with one cosine integral instead of a two-term cosine: the baseline that `specular.py` improves.
+Irradiance is ∫ l (n·ω)₊ dω; specular radiance is ∫ l f^s (n·ω)₊ dω with f^s of `brdf.py`, by the lobes of
+`specular.py`. `specular_lobe` and `specular_radiance_physg` are PhySG's warped distribution and its closed form with
+one cosine integral instead of a two-term cosine: the baseline that `specular.py` improves on.
 """
 
 import math
@@ -70,7 +70,7 @@ def specular_radiance_physg(
 
 
 class DiffusePoint(NamedTuple):
-    """What the irradiance alone needs of a shading point."""
+    """A shading point without a specular term."""
 
     normal: Vector3f
 
@@ -94,7 +94,7 @@ def _weigh(parts, gradient):
 
 
 def _sum_over_lobes(point, packed, count):
-    """What `_integrate_lobe` gives, of all lobes, by a symbolic loop in each lane.
+    """`_integrate_lobe` summed over all lobes, by a symbolic loop in each lane.
 
     `max_iterations` lets Dr.Jit differentiate the loop in reverse mode."""
     labels = ("irradiance",) if isinstance(point, DiffusePoint) else ("irradiance", "white", "grazing")
@@ -169,8 +169,8 @@ def _lobe_gradient(point, packed, count, gradient):
 
 
 class _SumOverLobes(dr.CustomOp):
-    """`_sum_over_lobes` with adjoints whose sums have a fixed order; `attached` says whether that of the lobes and that
-    of the point are wanted."""
+    """`_sum_over_lobes` with adjoints whose sums have a fixed order; `attached`: whether the gradients of the lobes and
+    of the point are needed."""
 
     def eval(self, packed, count, attached, *point):
         self.inputs, self.attached = (_point(point), packed, count), attached
@@ -212,7 +212,7 @@ def _sums(point, lobes):
 
 
 def irradiance(normal: Vector3f, lobes: TensorXf) -> Color3f:
-    """The irradiance of `shade` alone, for surfaces without a specular part."""
+    """The irradiance of `shade` alone, for surfaces without a specular term."""
     return _sums(DiffusePoint(normal), lobes)[0]
 
 
@@ -246,7 +246,7 @@ def shade_tensor(
 
 
 def shade_reference(normal, view, specular_albedo, roughness, lobes):
-    """`shade` by a Python loop over the lobes, differentiated by Dr.Jit: slow to compile, but nothing of its own."""
+    """`shade` by a Python loop over the lobes, differentiated by Dr.Jit: the slow reference."""
     irradiance, specular = mi.Color3f(0.0), mi.Color3f(0.0)
     for index in range(lobe_count(lobes)):
         lobe = unpack_lobe(lobes.array, index)

@@ -1,18 +1,18 @@
 """The specular reflectance at a shading point as lobes of light directions, and its integral against a light lobe.
 
 PhySG warps the normal distribution to one round lobe around the mirror direction. The reflectance times the light's
-cosine is longer than wide, is cut off at the horizon and, for rough surfaces seen at an angle, lies elsewhere. Here it
-is, in two parts (F = s + (1 − s) P, for F = 1 and for F = P), a lobe that is sharper across the plane of incidence,
+cosine, however, is elongated, cut off at the horizon and, for rough surfaces seen at an angle, displaced. Here it is
+split into two parts (F = s + (1 − s) P: F = 1 and F = P), each a lobe that is narrower across the plane of incidence,
 
     L(ω) = μ exp(ν (ω·a − 1) − κ (ω·b)²) (ω·n)₊,   b = n × v,
 
-with the part's exact integral over the hemisphere; axis a, sharpness ν and κ are tabulated by view cosine and
-roughness. Against a light lobe the product of the round factors is again a lobe. For a direction drawn from it, ω·b and
-ω·n have exactly known means; taking them as normally distributed gives the integral of both other factors.
+with the part's exact integral over the hemisphere. The axis a, ν and κ are tabulated by view cosine and roughness. The
+round factor times a light lobe is again a lobe. For a direction drawn from it, ω·b and ω·n have known means; taking
+them as normally distributed gives the integral of the other two factors.
 
-A light sharper than the reflectance sees its true shape: the result is multiplied by (f^s / L)^w, with f^s and L at the
-mean direction of the integrand and w = (λ / (λ + τ))², τ tabulated too. So the energy is right under broad lights, and
-under sharp ones the result tends to f^s × irradiance.
+Lights sharper than the reflectance resolve its true shape, so the result is multiplied by (f^s / L)^w, with f^s and L
+at the mean direction of the integrand and w = (λ / (λ + τ))², τ tabulated too. Broad lights keep their energy; for
+sharp ones the result tends to f^s × irradiance.
 """
 
 import math
@@ -30,10 +30,10 @@ MINIMUM_ROUGHNESS = 0.1
 MAXIMUM_ROUGHNESS = 1.0
 # A view below this cosine is shaded as if at it.
 _MINIMUM_VIEW_COSINE = 1e-3
-# How far from grazing a view is, by its cosine c: in the tables c (1 + x r²) / (c + x r²), and for the mean cosine of
-# view and half vectors √(c² + x r⁴).
+# x in the measures of how far a view of cosine c is from grazing: c (1 + x r²) / (c + x r²) in the tables, √(c² + x r⁴)
+# for the mean cosine of view and half vectors.
 _TABLE_GRAZING, _MEAN_GRAZING = 2.0, 0.2
-# Share of the variance along a lobe's axis that is left out; some must remain for its root to be differentiable.
+# Share of the variance along a lobe's axis that is subtracted; some must remain for its root to be differentiable.
 _AXIAL = 0.99
 # Bound of the log of the reflectance relative to its lobe; reached far out in the tails only.
 _MAXIMUM_CORRECTION = 6.0
@@ -42,7 +42,7 @@ _DARK = -1e4
 
 
 class LobeShape(NamedTuple):
-    """What is tabulated of a shading point; see `specular_table.py`."""
+    """The tabulated quantities of a shading point; see `specular_table.py`."""
 
     white_energy: Float
     white_turn: Float
@@ -55,8 +55,8 @@ class LobeShape(NamedTuple):
 
 
 class SpecularLobes(NamedTuple):
-    """What the integral against a light lobe needs of a shading point: for F = 1 (white) and for F = P (grazing) the
-    round factor of the lobe, for both its sharpness κ across the plane of incidence and the half point τ."""
+    """A shading point as the integral against a light lobe needs it: the round factors of the lobes for F = 1 (white)
+    and F = P (grazing), and their common sharpness κ across the plane of incidence and half point τ."""
 
     normal: Vector3f
     view: Vector3f
