@@ -1,21 +1,14 @@
 """Networks and the field in NumPy and float64, written from their definitions: what the fast ones are compared with."""
 
-import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields import mlp, sdf
+from sira_mi.avatar.shape import HeadShape
+from sira_mi.fields.sdf import SdfField
 
 
-def head_field(avatar, **replaced) -> sdf.SdfField:
-    """The avatar's field, with some of `deformation`, `reference` and `z_sdf` replaced by Floats."""
-    values = {k: mi.Float(avatar.tensors[k]) for k in ("deformation", "reference", "z_sdf")} | replaced
-    networks = avatar.architecture.networks
-    latent = mi.TensorXf(values["z_sdf"], (len(values["z_sdf"]), 1))
-    return sdf.SdfField(
-        mlp.layers(networks["deformation"], values["deformation"], latent),
-        mlp.layers(networks["reference"], values["reference"]),
-        avatar.architecture.sdf_octaves,
-    )
+def head_field(avatar, **replaced) -> SdfField:
+    """The avatar's field, with some parameters of its shape replaced by Floats."""
+    return HeadShape(avatar.architecture).field(avatar.tensors | replaced)
 
 
 def points_near_surface(count: int, seed: int = 3) -> np.ndarray:

@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import SMALL, small_avatar
+from doubles import head_field
 
 from sira_mi.conventions import HELD_OUT_VIEWS, LANDMARKS, LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import evaluate_in_chunks
-from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, signed_distance_and_slope
+from sira_mi.fields.sdf import signed_distance_and_slope
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.sg.radiance import Material, closed_form_radiance, radiance_of_scenes
 from sira_mi.training import af_sm
@@ -189,14 +189,7 @@ def model():
 @pytest.fixture(scope="module")
 def surface_points(model):
     """Points [N, 3] on the model's surface, by bisection along rays from the origin."""
-    networks = SMALL.networks
-    field = SdfField(
-        layers(
-            networks["deformation"], mi.Float(model.tensors["deformation"]), mi.TensorXf(np.zeros((6, 1), np.float32))
-        ),
-        layers(networks["reference"], mi.Float(model.tensors["reference"])),
-        SMALL.sdf_octaves,
-    )
+    field = head_field(model, z_sdf=np.zeros(SMALL.sdf_latent, np.float32))
     directions = unit(random(3, 600, seed=11))
     near, far = np.full((1, 600), 0.5, np.float32), np.full((1, 600), 2.5, np.float32)
     for _ in range(24):

@@ -10,6 +10,7 @@ from conftest import slopes
 from doubles import encoded_in_double, field_in_double, head_field, points_near_surface
 from scipy.spatial.transform import Rotation
 
+from sira_mi.avatar.shape import HeadShape, head_of, with_zero_latents
 from sira_mi.fields import sdf
 from sira_mi.fields.encoding import encode, encode_cooperative, encode_with_tangents, encoded_size
 
@@ -44,6 +45,30 @@ def test_gradient_of_the_field_equals_differences_in_float64(avatar):
     again = sdf.deform(head_field(avatar), mi.TensorXf(x))
     np.testing.assert_allclose(again[0].numpy(), x_ref, atol=1e-6)
     np.testing.assert_allclose(again[1].numpy(), gamma, atol=1e-6)
+
+
+def test_a_shape_takes_its_parameters_in_every_form(avatar):
+    """NumPy or Dr.Jit arrays, one head or several, whose points follow each other; what else a mapping holds is left
+    alone, and a pose moves the head."""
+    shape, tensors = HeadShape(avatar.architecture), avatar.tensors
+    x = points_near_surface(20)
+    expected = field_in_double(avatar, x.astype(np.float64))
+
+    def distances(parameters, x=x):
+        return sdf.signed_distance(shape.field(parameters), mi.TensorXf(x)).numpy()[0]
+
+    mean = with_zero_latents(tensors)
+    two = {**tensors, "z_sdf": np.stack([mean["z_sdf"], tensors["z_sdf"]], axis=1)}
+    floats = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
+    for parameters in (tensors, floats, head_of(two, 1)):
+        np.testing.assert_allclose(distances(parameters), expected, atol=1e-5)
+    both = distances(two, np.concatenate([x, x], axis=1))
+    np.testing.assert_allclose(both, np.concatenate([distances(mean), expected]), atol=1e-5)
+    assert np.abs(both[:20] - both[20:]).max() > 1e-3
+    shift = np.array([0.1, -0.2, 0.3], np.float32)
+    pose = np.concatenate([np.zeros(3, np.float32), shift])
+    moved = distances({**tensors, "pose": pose}, x - shift[:, None])
+    np.testing.assert_allclose(moved, expected, atol=1e-5)
 
 
 def test_a_rigid_motion_is_one_and_carries_the_field_along(avatar):

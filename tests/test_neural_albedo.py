@@ -5,10 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import camera, slopes
+from doubles import head_field
 
 from sira_mi.export import scene as scenes
-from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, deform
+from sira_mi.fields.sdf import deform
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 
 DIFFUSE = ("weights", "latent", "refinement", "k_r")
@@ -26,9 +26,7 @@ def interaction(count: int = 200):
 
 def in_reference_space(avatar, p):
     """x_ref and γ of points under the avatar's own deformation."""
-    networks, t = avatar.architecture.networks, avatar.tensors
-    deformation = layers(networks["deformation"], mi.Float(t["deformation"]), mi.TensorXf(t["z_sdf"][:, None]))
-    return deform(SdfField(deformation, [], avatar.architecture.sdf_octaves), mi.TensorXf(np.array(p)))
+    return deform(head_field(avatar), mi.TensorXf(np.array(p)))
 
 
 @pytest.mark.slow

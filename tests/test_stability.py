@@ -8,12 +8,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import small_avatar
+from doubles import head_field
 from scipy.special import erfcx
 
 import sira_mi.sg.integrals as integrals
 from sira_mi.errors import InputError
-from sira_mi.fields.mlp import layers
-from sira_mi.fields.sdf import SdfField, surface
+from sira_mi.fields.sdf import surface
 from studies.stability.fields64 import Field64
 from studies.stability.fit_runs import list_code
 from studies.stability.page import Measured, fill_template, load_rows, write_page
@@ -86,13 +86,7 @@ def test_a_fit_of_corrupt_input_is_repeated_when_the_code_of_fits_changes():
 def test_the_reference_field_is_the_package_s():
     """Value and gradient of the NumPy networks in float64 against the package's in single precision."""
     avatar = small_avatar()
-    networks = avatar.architecture.networks
-    latent = mi.TensorXf(avatar.tensors["z_sdf"][:, None])
-    field = SdfField(
-        layers(networks["deformation"], mi.Float(avatar.tensors["deformation"]), latent),
-        layers(networks["reference"], mi.Float(avatar.tensors["reference"])),
-        avatar.architecture.sdf_octaves,
-    )
+    field = head_field(avatar)
     x = np.random.default_rng(0).uniform(-2, 2, (3, 500)).astype(np.float32)
     value, gradient = (part.numpy() for part in surface(field, mi.TensorXf(x))[:2])
     exact = Field64.of(field)

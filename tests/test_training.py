@@ -15,6 +15,7 @@ from sira_mi.avatar.shape import head_of
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import extract
 from sira_mi.optimisation.adam import adam, read_arrays
+from sira_mi.portrait.camera import yaw_rotation
 from sira_mi.training import af_sm, pictures, sa_sm, train
 from sira_mi.training import loop as training
 from sira_mi.training.__main__ import main
@@ -290,7 +291,7 @@ def test_a_ball_is_drawn_as_a_shaded_disc(avatar):
 
 def test_rays_meet_an_analytic_ball_where_it_is():
     extracted = extract(lambda p: np.linalg.norm(p, axis=0) - 1.0, 0.1)
-    view = pictures._view(40.0)
+    view = yaw_rotation(40.0)
     hit, points = pictures._crossings(extracted.grid, extracted.spacing, view)
     assert np.abs(np.linalg.norm(points, axis=0) - 1).max() < 0.02
     assert (view[2] @ points > -0.02).all()
