@@ -138,10 +138,7 @@ class SiraSG(mi.SamplingIntegrator):
         index = dr.compress(hits.shaded)
         columns = None
         if dr.width(index) > 0:
-            shader = HeadShader(self, scene, head, light, attached)
-            columns = (
-                shader.shade_mesh(ray, hits, index) if hits.on_mesh is not None else shader.shade(ray, hits, index)
-            )
+            columns = HeadShader(self, scene, head, light, attached).shade(ray, hits, index)
 
         # Scatter: from the columns back to the rays.
         parts, row = {}, 0
@@ -168,14 +165,11 @@ class SiraSG(mi.SamplingIntegrator):
         if not self.aovs:
             return color, valid, []
         parts |= {"depth": dr.select(hit, t, 0.0), "mask": dr.select(hit, mi.Float(1.0), 0.0)}
-        return (
-            color,
-            valid,
-            [c for name in EXTRA_LAYERS for c in (parts[name] if EXTRA_LAYERS[name] else [parts[name]])],
-        )
+        extra = (parts[name] for name in EXTRA_LAYERS)
+        return color, valid, [c for part in extra for c in (part if isinstance(part, mi.Color3f) else [part])]
 
     def rows(self) -> dict[str, int]:
-        """Rows of the tensor that `HeadShader` gives, by layer."""
+        """Number of rows of each layer in the tensor that `HeadShader` returns."""
         names = ["diffuse", "specular", *(("diffuse_albedo", "specular_albedo", "normal") if self.aovs else ())]
         refinement = {} if self.refinement is None else {"light_refinement": 3}
         return {name: channel_count(name) for name in names} | refinement
@@ -199,7 +193,7 @@ class LightRefinement(NamedTuple):
     octaves: int
 
     def factor(self, x_ref, gamma):
-        """What the radiance is multiplied by [3, N], at points of the reference space."""
+        """Factor of the radiance [3, N] at points of the reference space."""
         return dr.exp(light_refinement(self.network, self.octaves, x_ref, gamma))
 
 
@@ -232,7 +226,7 @@ class Hits:
 
 def find_hits(scene, head, ray, active, samples: int, exact: bool) -> Hits:
     """Hits of the rays on the head, on its field (`exact`) or on its mesh. With `samples` > 1, that many consecutive
-    rays are a pixel and share a shading where they may."""
+    rays are a pixel, whose shading is shared where `representative_samples` allows it."""
     if samples == 1 and exact:
         return Hits(*trace_head(scene, head, ray, active))
     with dr.suspend_grad():
@@ -270,7 +264,9 @@ class HeadShader:
         self.to_world = mi.TensorXf(rotation_of(head.to_world))
 
     def shade(self, ray, hits: Hits, index):
-        """At the exact hits of the rays `index`."""
+        """At the hits of the rays `index`."""
+        if hits.on_mesh is not None:
+            return self._shade_mesh(ray, hits, index)
         local = self.head.to_local @ ray
         origin, direction, t = (gather_columns(v, index) for v in (local.o, local.d, hits.t))
         if self.attached:
@@ -278,7 +274,7 @@ class HeadShader:
         x = on_ray(origin, direction, t)
         return mi.TensorXf(evaluate_in_chunks(self._shade_field, x.numpy(), direction.numpy())[0])
 
-    def shade_mesh(self, ray, hits: Hits, index):
+    def _shade_mesh(self, ray, hits: Hits, index):
         """At the hits on the mesh of the rays `index`, with its normals; without gradients."""
         si = dr.gather(mi.SurfaceInteraction3f, hits.on_mesh, index)
         to_local = mi.TensorXf(np.ascontiguousarray(rotation_of(self.head.to_world).T))
