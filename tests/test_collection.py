@@ -24,13 +24,13 @@ from sira_mi.training.collection import (
     landmarks,
     look,
     makehuman,
-    outer,
     person,
     rebuild_pack,
     render,
     scene,
     skin,
     surface,
+    triangles,
 )
 from sira_mi.training.collection.__main__ import main as collection_command
 from sira_mi.training.collection.annotate_landmarks import attach, symmetrise
@@ -90,7 +90,7 @@ def test_macro_weights_are_a_partition():
 
 def test_left_and_right_axes_are_nearly_equal_and_of_the_right_size():
     """Pairs share one draw (correlation above 0.9); spread is the category's."""
-    values = {"l": [], "r": []}
+    values: dict[str, list[float]] = {"l": [], "r": []}
     for seed in range(150):
         axes = random_identity(seed).axes
         for side in "lr":
@@ -195,7 +195,8 @@ def test_skin_stays_within_the_measured_range():
     for seed in range(6):
         random = np.random.default_rng(seed)
         identity = random_identity(seed)
-        drawn = look.sample_look(random, identity, True)
+        traits = look.Traits(identity.years, identity.male, identity.ancestry)
+        drawn = look.sample_look(random, traits, True)
         cloth = skin.cloth_mask(drawn)
         none = np.zeros(len(cloth))
         albedo, specular = skin.paint_head(drawn, cloth, none)
@@ -208,14 +209,15 @@ def test_skin_stays_within_the_measured_range():
         assert cloth[rest[:, 1] < 4.9].min() > 0.9 and cloth[rest[:, 1] > 6.4].max() == 0
 
 
-def test_point_triangle_distance_against_dense_sampling():
+def test_distance_to_triangles_against_dense_sampling():
     random = np.random.default_rng(0)
     points, corners = random.standard_normal((40, 3)), random.standard_normal((40, 3, 3))
     a, b = np.meshgrid(np.linspace(0, 1, 160), np.linspace(0, 1, 160))
     bary = np.stack([1 - a - b, a, b], -1)[a + b <= 1]
     dense = np.einsum("sk,nkd->nsd", bary, corners)
     reference = np.linalg.norm(dense - points[:, None], axis=2).min(1)
-    assert np.allclose(outer.point_triangle_distance(points, corners), reference, atol=0.01)
+    closest = np.einsum("nk,nkd->nd", triangles.closest_on_triangles(points, corners), corners)
+    assert np.allclose(np.linalg.norm(points - closest, axis=1), reference, atol=0.01)
 
 
 def test_scene_has_the_documented_layout(arrays):

@@ -11,8 +11,10 @@ import trimesh
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.training.collection import ict, registration
+from sira_mi.training.collection import triangles as triangle_meshes
 from sira_mi.training.collection.ict import ict_control, sample_coefficients
 from sira_mi.training.collection.makehuman import BODY_VERTICES, LEFT_EYE, Identity, identity_vertices, load_pack
+from sira_mi.training.collection.similarity import fit_similarity
 from sira_mi.training.collection.skin import rest_surface
 from sira_mi.training.collection.surface import eye_spheres, head_surface, refine_attribute, refinement, unit_eye
 
@@ -42,8 +44,8 @@ def made_up(tmp_path_factory) -> dict:
     # Every quad is refined into four, each of which is two triangles.
     kept = np.concatenate([np.repeat(open_quads, 4)] * 2)
     kept = triangles[: len(kept)][kept]
-    kept = trimesh.Trimesh(head, kept, process=False).split(only_watertight=False, repair=False)
-    skin = max(kept, key=lambda piece: len(piece.faces))
+    pieces = trimesh.Trimesh(head, kept, process=False).split(only_watertight=False, repair=False)
+    skin = max(pieces, key=lambda piece: len(piece.faces))
     vertices, faces = np.asarray(skin.vertices), np.asarray(skin.faces)
     spheres, unit, around = eye_spheres(control), *unit_eye()
     for centre, radius in spheres:
@@ -94,7 +96,7 @@ def file_frame(control, expected) -> np.ndarray:
 
 def surface_distance(points, vertices, triangles) -> np.ndarray:
     """Distances [N] in mm."""
-    _, found, _ = registration.nearest(points, None, vertices, triangles, candidates=24)
+    _, found, _ = triangle_meshes.find_nearest(points, None, vertices, triangles, candidates=24)
     return np.linalg.norm(found - points, axis=1) * MILLIMETRES_PER_UNIT
 
 
@@ -164,7 +166,7 @@ def test_head_is_in_the_projects_frame(heads):
         assert nose[nose[:, 2].argmax(), 2] > 1.0
 
 
-def spoil(arrays: dict, kind: str) -> dict:
+def corrupt(arrays: dict, kind: str) -> dict:
     arrays = {name: values.copy() for name, values in arrays.items()}
     if kind == "an array is missing":
         del arrays["basis"]
@@ -209,7 +211,7 @@ def spoil(arrays: dict, kind: str) -> dict:
 )
 def test_broken_arrays_are_refused_in_one_line(made_up, tmp_path, kind):
     path = tmp_path / "broken.npz"
-    np.savez(path, **spoil(made_up["arrays"], kind))
+    np.savez(path, **corrupt(made_up["arrays"], kind))
     with pytest.raises(InputError) as caught:
         ict_control(path, np.zeros(3))
     assert "\n" not in str(caught.value)
@@ -253,7 +255,7 @@ def test_closest_points_agree_with_trimesh():
     random = np.random.default_rng(0)
     corners = random.standard_normal((2000, 3, 3))
     points = 2 * random.standard_normal((2000, 3))
-    weights = registration.closest_on_triangles(points, corners)
+    weights = triangle_meshes.closest_on_triangles(points, corners)
     found = np.einsum("nk,nkd->nd", weights, corners)
     assert (weights >= 0).all()
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-12)
@@ -265,10 +267,10 @@ def test_similarity_is_recovered():
     points = random.standard_normal((40, 3))
     rotation = np.linalg.qr(random.standard_normal((3, 3)))[0]
     rotation *= np.sign(np.linalg.det(rotation))
-    scale, turn, shift = registration.similarity(points, 0.7 * points @ rotation.T + [1, -2, 3])
-    assert abs(scale - 0.7) < 1e-12
-    np.testing.assert_allclose(turn, rotation, atol=1e-12)
-    np.testing.assert_allclose(shift, [1, -2, 3], atol=1e-12)
+    found = fit_similarity(points, 0.7 * points @ rotation.T + [1, -2, 3])
+    assert abs(found.scale - 0.7) < 1e-12
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(found.shift, [1, -2, 3], atol=1e-12)
 
 
 def test_biharmonic_energy_is_the_squared_laplacians_integral():

@@ -10,7 +10,7 @@ from egg import HAIR, SIZE, SKIN, head_like, landmarks_on, truth_of, turned_came
 from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
-from sira_mi.training.collection.annotation import Similarity
+from sira_mi.training.collection.similarity import Similarity
 from studies.portraits.alignment import Icp, distances_from, icp, inverse
 from studies.portraits.geometry_scores import (
     GeometrySettings,

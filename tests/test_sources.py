@@ -6,6 +6,7 @@ import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 # isort: split
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
 from sira_mi.training.collection import annotation, skin
-from sira_mi.training.collection.annotation import Similarity, align, axis_turns, check_landmarks, mean_head
+from sira_mi.training.collection.annotation import axis_turns, check_landmarks, mean_head
 from sira_mi.training.collection.landmarks import mesh_landmarks
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.sheet import encode_srgb
+from sira_mi.training.collection.similarity import Similarity, fit_robustly
 from sira_mi.training.collection.sources import meshes, valid
 from sira_mi.training.collection.sources.meshes import MeshSource
 from sira_mi.training.collection.sources.valid import ValidSource, group_of
@@ -72,10 +74,10 @@ def test_alignment_recovers_a_similarity_in_spite_of_outliers():
     truth = Similarity(0.37, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), np.array([3.0, -2.0, 5.0]))
     target = truth(points)
     target[::10] += random.standard_normal((20, 3))
-    found = align(points, target, scaled=True)
+    found = fit_robustly(points, target, scaled=True)
     assert found.scale == pytest.approx(truth.scale, rel=1e-3)
     assert np.allclose(found.rotation, truth.rotation, atol=1e-3) and np.allclose(found.shift, truth.shift, atol=1e-3)
-    mirrored = align(points, points * [-1, 1, 1], scaled=True)
+    mirrored = fit_robustly(points, points * [-1, 1, 1], scaled=True)
     assert np.linalg.det(mirrored.rotation) == pytest.approx(1)
     back = Similarity(2.0, truth.rotation.T, np.ones(3))
     assert np.allclose(back.after(truth)(points), back(truth(points)))
@@ -174,7 +176,7 @@ def test_mesh_of_unknown_unit_and_axes(person, tmp_path, ending, scale, turn, sh
     assert both.sum() > 400
     assert np.median(millimetres(subject.landmarks, placed)[both]) < 3
     target, target_valid = mean_head()
-    ideal = align(known[known_valid & target_valid], target[known_valid & target_valid], scaled=True)
+    ideal = fit_robustly(known[known_valid & target_valid], target[known_valid & target_valid], scaled=True)
     assert np.mean(millimetres(ideal(known), placed)[known_valid]) < 3
     nose = cKDTree(subject.parts[0].vertices).query(placed[1])[1]
     true_nose = cKDTree(person.head).query(known[1])[1]
@@ -219,8 +221,8 @@ def test_broken_meshes_are_refused_with_the_reason(tmp_path, monkeypatch):
         return str(refused.value)
 
     def with_vertex(value):
-        spoilt = ball.copy()
-        vertices = np.array(spoilt.vertices)
+        corrupted = ball.copy()
+        vertices = np.array(corrupted.vertices)
         vertices[7] = value
         return trimesh.Trimesh(vertices, ball.faces, process=False)
 
@@ -275,7 +277,7 @@ def write_avatar(folder, person, name="X_White_F_7"):
     vertices = np.concatenate([piece[1] for piece in pieces])
     eyes = [p.vertices.mean(0) for p in person.parts[1:3]]
     to_metres = Similarity(1 / units, np.eye(3), np.array([0.0, 1.6, 0.05]))
-    arrays = {
+    arrays: dict[str, Any] = {
         "v": to_metres(vertices).astype(np.float32),
         "f": np.concatenate([piece[2] + o for piece, o in zip(pieces, offsets, strict=False)]).astype(np.int32),
         "uv": np.stack([(vertices[:, 0] + 3) / 6, (3 - vertices[:, 1]) / 6], 1).astype(np.float32),
@@ -305,7 +307,7 @@ def test_avatar_in_metres_keeps_its_size_and_gets_regions(person, avatar_folder)
     assert all(np.array_equal(a.albedo, b.albedo) for a, b in zip(subject.parts, again.parts, strict=True))
     known, known_valid = mesh_landmarks(person.head)
     target, target_valid = mean_head()
-    ideal = align(known[known_valid & target_valid], target[known_valid & target_valid], scaled=False)
+    ideal = fit_robustly(known[known_valid & target_valid], target[known_valid & target_valid], scaled=False)
     both = known_valid & subject.landmarks_valid
     assert both.sum() > 360
     assert np.median(millimetres(subject.landmarks, ideal(known))[both]) < 3.5

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.landmarks import INNER_EYE_CORNERS, MOUTH_CORNERS, NOSE_BASE, NOSE_TIP
-from sira_mi.training.collection.annotation import Similarity
-from sira_mi.training.collection.registration import similarity
+from sira_mi.training.collection.similarity import Similarity, fit_similarity
 from studies.portraits.surface_distance import TriangleTree
 
 # The landmarks of H3DS among the 468: inner corners of the right and the left eye, tip and base of the nose, right and
@@ -46,7 +45,7 @@ def select_shared_landmarks(predicted: np.ndarray, truth: np.ndarray) -> tuple[n
 
 def landmark_alignment(predicted: np.ndarray, truth: np.ndarray) -> Similarity:
     """Procrustes analysis of landmarks [n, 3] (Umeyama 1991)."""
-    return Similarity(*similarity(predicted, truth))
+    return fit_similarity(predicted, truth)
 
 
 def inverse(map: Similarity) -> Similarity:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sira_mi.training.collection.registration import closest_on_triangles
+from sira_mi.training.collection.triangles import closest_on_triangles
 
 _MORTON_BITS = 16
 _FLAT = 1e-12  # of twice a triangle's area over its longest edge squared: thinner ones are left out

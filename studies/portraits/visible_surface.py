@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.portrait.camera import Camera
-from sira_mi.training.collection.outer import seen_from_afar
-from sira_mi.training.collection.render import blocked_towards
-from sira_mi.training.collection.surface import vertex_normals
+from sira_mi.training.collection.outer import is_seen_from_afar
+from sira_mi.training.collection.render import is_blocked_towards
+from sira_mi.training.collection.triangles import vertex_normals
 from studies.portraits.surface_distance import face_normals
 
 _CLEARANCE = 2e-3  # scene units between a surface and the start of a ray that leaves it
@@ -83,7 +83,7 @@ def is_seen_by_camera(scene: mi.Scene, camera: Camera, points: np.ndarray, norma
     result = np.zeros(len(points), bool)
     index = np.flatnonzero(inside)
     if len(index):
-        result[index] = ~blocked_towards(scene, (points + _CLEARANCE * towards * normals)[index], camera.centre)
+        result[index] = ~is_blocked_towards(scene, (points + _CLEARANCE * towards * normals)[index], camera.centre)
     return result
 
 
@@ -123,7 +123,7 @@ def mesh_images(vertices: np.ndarray, faces: np.ndarray, camera: Camera, scene: 
 
 def _seen_on_a_side(scene, points, normals):
     """Whether points on a surface can be seen from afar, from one side of it or the other."""
-    seen = seen_from_afar(scene, points, normals)
+    seen = is_seen_from_afar(scene, points, normals)
     rest = np.flatnonzero(~seen)
-    seen[rest] = seen_from_afar(scene, points[rest], -normals[rest])
+    seen[rest] = is_seen_from_afar(scene, points[rest], -normals[rest])
     return seen

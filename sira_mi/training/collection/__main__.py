@@ -83,10 +83,11 @@ def sources_of(arguments: argparse.Namespace) -> tuple:
     from sira_mi.training.collection.sources.makehuman import MakeHumanSource
     from sira_mi.training.collection.sources.meshes import MeshSource
     from sira_mi.training.collection.sources.valid import ValidSource
+    from sira_mi.training.collection.subject import Source
 
     if arguments.hair is not None:
         list_hair(arguments.hair)
-    sources = [MakeHumanSource(arguments.count, arguments.hair)]
+    sources: list[Source] = [MakeHumanSource(arguments.count, arguments.hair)]
     if arguments.ict is not None:
         sources.append(IctSource(arguments.ict, arguments.ict_count, arguments.hair))
     if arguments.valid is not None:

@@ -17,11 +17,12 @@ from tqdm import tqdm
 
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError, run_command
-from sira_mi.training.collection.annotation import AnnotationSettings, closest_on_surface, consensus, mark_views
+from sira_mi.training.collection.annotation import AnnotationSettings, consensus, mark_views
 from sira_mi.training.collection.landmarks import BARYCENTRICS
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.skin import rest_surface
 from sira_mi.training.collection.surface import head_topology
+from sira_mi.training.collection.triangles import find_nearest
 
 SETTINGS = AnnotationSettings(size=512, grid=2, expected_cosine=-1, search=True)
 FEWEST_MARKS = 5
@@ -49,8 +50,8 @@ def symmetrise(positions: np.ndarray) -> np.ndarray:
 def attach(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertex indices [N, 3] and barycentric weights [N, 3] of the rest surface's points nearest to positions [N, 3]."""
     triangles = head_topology()[0]
-    chosen, weights = closest_on_surface(positions, rest_surface(), triangles)
-    return triangles[chosen], weights
+    places, _, _ = find_nearest(positions, None, rest_surface(), triangles, candidates=24)
+    return triangles[places.triangles], places.weights
 
 
 def main() -> None:

@@ -7,15 +7,15 @@ The landmarks also give the head its frame: they are aligned with those of the m
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.portrait.face import Face, find_faces, refine_landmarks
@@ -33,9 +33,11 @@ from sira_mi.training.collection.render import (
     project,
 )
 from sira_mi.training.collection.sheet import encode_srgb
+from sira_mi.training.collection.similarity import Similarity, fit_robustly
 from sira_mi.training.collection.skin import EYE, SKIN
 from sira_mi.training.collection.subject import BrokenHead
-from sira_mi.training.collection.surface import eye_spheres, head_surface, vertex_normals
+from sira_mi.training.collection.surface import eye_spheres, head_surface
+from sira_mi.training.collection.triangles import find_nearest, vertex_normals
 
 # Direction and irradiance of the lamps: a key light, sides, above, below, from the camera.
 LAMPS = np.array(
@@ -51,6 +53,7 @@ SHORTEST_AXIS = 1e-9  # share of the longest side of the box around a head
 LARGEST_MISFIT = 9.0
 # Scale to the mean head's size outside which a head of known unit is not in that unit.
 NATURAL_SCALE = (0.75, 1.35)
+_CANDIDATES = 24  # triangles among which the skin nearest to a mark is sought
 TURN_LIMIT = 8.0  # degrees between the assumed and the found frame above which the marks are made again
 
 
@@ -79,26 +82,6 @@ class Marks:
     weights: np.ndarray  # [V, 468, 3] barycentric weights
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """x → scale · rotation x + shift."""
-
-    scale: float
-    rotation: np.ndarray  # [3, 3]
-    shift: np.ndarray  # [3] units of the target
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        return self.scale * points @ self.rotation.T + self.shift
-
-    def after(self, first: Similarity) -> Similarity:
-        """The map that applies `first`, then this one."""
-        return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self(first.shift))
-
-    def moved(self, parts: list[Part]) -> list[Part]:
-        """The parts in the target frame."""
-        return [replace(p, vertices=self(p.vertices), normals=p.normals @ self.rotation.T) for p in parts]
-
-
 @cache
 def _mean_control():
     share = 1 / len(ANCESTRIES)
@@ -122,53 +105,6 @@ def _mean_normals():
     head, triangles = head_surface(_mean_control())
     normals = mesh_landmarks(vertex_normals(head, triangles))[0]
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-
-
-def align(source: np.ndarray, target: np.ndarray, scaled: bool) -> Similarity:
-    """The proper similarity (rigid motion unless `scaled`) that takes points [N, 3] closest to others [N, 3]: least
-    squares (Umeyama 1991), reweighted five times so that points that do not fit count less."""
-    weights = np.ones(len(source))
-    for _ in range(6):
-        share = weights / weights.sum()
-        centre, goal = share @ source, share @ target
-        a, b = source - centre, target - goal
-        u, singular, vt = np.linalg.svd((share[:, None] * b).T @ a)
-        flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-        rotation = (u * flip) @ vt
-        scale = float((singular * flip).sum() / max((share[:, None] * a * a).sum(), 1e-30)) if scaled else 1.0
-        found = Similarity(scale, rotation, goal - scale * rotation @ centre)
-        distance = np.linalg.norm(found(source) - target, axis=1)
-        weights = 1 / (1 + (distance / max(np.median(distance), 1e-9)) ** 2)
-    return found
-
-
-def closest_on_surface(
-    positions: np.ndarray, vertices: np.ndarray, triangles: np.ndarray, candidates: int = 24
-) -> tuple[np.ndarray, np.ndarray]:
-    """Triangle indices [N] and barycentric weights [N, 3] of the surface points nearest to positions [N, 3], among the
-    triangles with the nearest centres."""
-    corners = vertices[triangles]
-    _, near = cKDTree(corners.mean(1)).query(positions, k=min(candidates, len(triangles)))
-    best, weights = np.full(len(positions), np.inf), np.zeros((len(positions), 3))
-    chosen = np.zeros(len(positions), int)
-    for column in near.reshape(len(positions), -1).T:
-        bary = _closest_weights(positions, corners[column])
-        gap = np.linalg.norm(np.einsum("nk,nkd->nd", bary, corners[column]) - positions, axis=1)
-        better = gap < best
-        best[better], weights[better], chosen[better] = gap[better], bary[better], column[better]
-    return chosen, weights
-
-
-def _closest_weights(points, corners):
-    """Barycentric weights of the plane projections, clipped into the triangle."""
-    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    w = points - a
-    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
-    determinant = np.maximum(uu * vv - uv * uv, 1e-18)
-    s = (vv * (w * u).sum(1) - uv * (w * v).sum(1)) / determinant
-    t = (uu * (w * v).sum(1) - uv * (w * u).sum(1)) / determinant
-    weights = np.clip(np.stack([1 - s - t, s, t], 1), 0, 1)
-    return weights / weights.sum(1, keepdims=True)
 
 
 def cameras(settings: AnnotationSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -209,14 +145,16 @@ def photos(
     rays = [_rays(pixel.reshape(-1, 3), k, pose) for k, pose in zip(intrinsics, poses, strict=True)]
     origin, way = (np.concatenate(column).T.astype(np.float32) for column in zip(*rays, strict=True))
     hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(way)))
-    normal = dr.select(dr.dot(hit.sh_frame.n, hit.to_world(hit.wi)) > 0, hit.sh_frame.n, -hit.sh_frame.n)
+    normal: Any = mi.Vector3f(hit.sh_frame.n)  # the stubs of `dr.dot` take no Mitsuba vector
+    normal = dr.select(dr.dot(normal, hit.to_world(hit.wi)) > 0, normal, -normal)
     light = mi.Float(AMBIENT)
     for x, y, z, irradiance in LAMPS.tolist():
         lamp = dr.normalize(mi.Vector3f(x, y, z))
         shadow = scene.ray_test(hit.spawn_ray(lamp), hit.is_valid())
         light += dr.select(shadow, 0, irradiance * dr.maximum(dr.dot(normal, lamp), 0))
     albedo = hit.shape.eval_attribute_3("vertex_albedo", hit, hit.is_valid())
-    channels = [np.array(channel) for channel in (*(albedo * light), dr.select(hit.is_valid(), mi.Float(1), 0))]
+    cover = dr.select(hit.is_valid(), mi.Float(1), 0)
+    channels = [np.array(channel) for channel in (*(channel * light for channel in albedo), cover)]
     fine = np.nan_to_num(np.stack(channels, axis=-1)).reshape(len(poses), size, grid, size, grid, 4)
     shown = []
     for image in fine.mean((2, 4)):
@@ -314,10 +252,8 @@ def _onto_skin(positions, parts):
     corners = np.concatenate(pieces)
     if not len(corners):
         raise BrokenHead("no skin where its face was found")
-    triangle, weights = closest_on_surface(
-        positions, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
-    )
-    return np.einsum("nk,nkd->nd", weights, corners[triangle])
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    return find_nearest(positions, None, corners.reshape(-1, 3), triangles, candidates=_CANDIDATES)[1]
 
 
 def find_face(parts: list[Part], turns: Iterator[np.ndarray] | list[np.ndarray]) -> Similarity:
@@ -340,14 +276,14 @@ def find_face(parts: list[Part], turns: Iterator[np.ndarray] | list[np.ndarray])
             raise BrokenHead("it is flat or empty")
         scale = SEARCH_SPAN / span
         first = Similarity(scale, turn, -scale * (lower + upper) / 2)
-        placed = first.moved(parts)
+        placed = first.move(parts)
         scene, shown = photos(placed, intrinsic, pose, settings)
         for face in find_faces(shown[0])[:1]:
             points, *_ = _trace(scene, placed, face.landmarks, intrinsic[0], pose[0], settings.smallest_cosine)
             seen = target_valid & np.isfinite(points[:, 0])
             if seen.sum() < LANDMARKS // 3:
                 continue
-            second = align(points[seen], target[seen], scaled=True)
+            second = fit_robustly(points[seen], target[seen], scaled=True)
             if misfit(second(points[seen]), target[seen]) < LARGEST_MISFIT:
                 return second.after(first)
     raise BrokenHead("no face found on it from any side")
@@ -379,17 +315,17 @@ def place(
     target, target_valid = mean_head()
     frame = rough
     for _ in range(2):
-        placed = frame.moved(parts)
+        placed = frame.move(parts)
         landmarks, valid, spread = annotate(placed, settings)
         both = valid & target_valid
         if both.sum() < LANDMARKS // 3:
             raise BrokenHead(f"only {both.sum()} of {LANDMARKS} face landmarks can be seen")
-        free = align(landmarks[both], target[both], scaled=True)
+        free = fit_robustly(landmarks[both], target[both], scaled=True)
         if misfit(free(landmarks[both]), target[both]) > LARGEST_MISFIT:
             raise BrokenHead("what the landmark network marked is no face")
         if natural_size and not NATURAL_SCALE[0] < free.scale < NATURAL_SCALE[1]:
             raise BrokenHead(f"its face is {1 / free.scale:.2f} times the mean face's size: not in the stated unit")
-        change = align(landmarks[both], target[both], scaled=not natural_size)
+        change = fit_robustly(landmarks[both], target[both], scaled=not natural_size)
         frame = change.after(frame)
         turn = np.degrees(np.arccos(np.clip((np.trace(change.rotation) - 1) / 2, -1, 1)))
         if turn < TURN_LIMIT and abs(np.log(change.scale)) < 0.15 and np.linalg.norm(change.shift) < 0.5:
@@ -413,8 +349,8 @@ def check_landmarks(
         distances.append(np.linalg.norm(found - known, axis=1)[both])
         shares.append(both.sum() / known_valid.sum())
         target, target_valid = mean_head()
-        usual = align(known[known_valid & target_valid], target[known_valid & target_valid], scaled=False)
-        change = align(found[both & target_valid], target[both & target_valid], scaled=False)
+        usual = fit_robustly(known[known_valid & target_valid], target[known_valid & target_valid], scaled=False)
+        change = fit_robustly(found[both & target_valid], target[both & target_valid], scaled=False)
         shifts.append(np.linalg.norm(change(known) - usual(known), axis=1)[known_valid].mean())
         cosine = (np.trace(change.rotation.T @ usual.rotation) - 1) / 2
         turns.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -18,6 +18,7 @@ from skimage.measure import marching_cubes
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.errors import InputError
 from sira_mi.training.collection.makehuman import load_pack
+from sira_mi.training.collection.triangles import draw_barycentric, triangle_areas
 
 VOXEL = 0.04  # scene units
 CLOSING = 0.16  # scene units: gaps between sheets up to twice this are filled
@@ -78,7 +79,7 @@ def _read_alpha(folder: Path) -> np.ndarray | None:
     for path in sorted(folder.glob("*_diffuse.png")):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is not None and image.ndim == 3 and image.shape[2] == 4:
-            return image[..., 3].astype(np.float32) / np.iinfo(image.dtype).max
+            return image[..., 3].astype(np.float32) / (65535 if image.dtype == np.uint16 else 255)
     return None
 
 
@@ -145,13 +146,10 @@ def sample_sheets(
     across the strands [S], and the direction of the strands [S, 3]."""
     corners = vertices[mesh.triangles]
     edge_u, edge_v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = 0.5 * np.linalg.norm(np.cross(edge_u, edge_v), axis=1)
+    area = triangle_areas(corners)
     number = random.poisson(area / SAMPLE_SPACING**2) + 1
     triangle = np.repeat(np.arange(len(area)), number)
-    a, b = random.random((2, len(triangle)))
-    swap = a + b > 1
-    a[swap], b[swap] = 1 - a[swap], 1 - b[swap]
-    bary = np.stack([1 - a - b, a, b], axis=1)
+    bary = draw_barycentric(random, len(triangle))
     points = np.einsum("sk,skd->sd", bary, corners[triangle])
     coordinates = np.einsum("sk,skd->sd", bary, mesh.texture[triangle])
     # Direction in which the texture's v axis runs over each triangle.

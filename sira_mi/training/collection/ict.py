@@ -29,17 +29,17 @@ from sira_mi.training.collection.makehuman import (
 )
 from sira_mi.training.collection.registration import (
     Level,
-    Places,
     Problem,
     Rows,
     fit_sphere,
     match_rings,
     register,
-    similarity,
     stack,
 )
+from sira_mi.training.collection.similarity import fit_similarity
 from sira_mi.training.collection.skin import step
 from sira_mi.training.collection.surface import border_loops, eye_spheres, head_topology, refinement
+from sira_mi.training.collection.triangles import Places
 
 LARGEST_COEFFICIENT = 2.5  # standard deviations
 # The body that carries the heads: a mean adult, arms lowered by 0.4 radians.
@@ -160,7 +160,8 @@ def _walk(ring, edges):
 def _lids() -> tuple[np.ndarray, np.ndarray]:
     """Refined vertices on the rims and fronts of the left and the right eye's lids."""
     used = np.unique(load_pack().quads)
-    return tuple(np.searchsorted(used, np.concatenate(rings[LID_RING + 1 : LID_RING + 4])) for rings in _rings())
+    left, right = (np.searchsorted(used, np.concatenate(rings[LID_RING + 1 : LID_RING + 4])) for rings in _rings())
+    return left, right
 
 
 @lru_cache(maxsize=1)
@@ -218,7 +219,7 @@ def _aligned(basis, path):
     matrix = Places(np.arange(len(both)), weights[both]).matrix(vertices[both], refined.shape[0]) @ refined
     own = matrix @ control
     goals = marks[both]
-    scale = similarity(own, goals)[0]
+    scale = fit_similarity(own, goals).scale
     template = scale * (control - own.mean(0)) + goals.mean(0)
     source = Places(places.triangles[both], places.weights[both]).matrix(basis.skin, len(basis.mean))
     used = np.unique(load_pack().quads)

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait.face import find_faces
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.lighting import lobe_map
-from sira_mi.training.collection.registration import Places, fit_sphere, nearest
+from sira_mi.training.collection.registration import fit_sphere
 from sira_mi.training.collection.render import (
     Part,
     RenderSettings,
@@ -23,8 +20,10 @@ from sira_mi.training.collection.render import (
     look_at,
     render_views,
 )
+from sira_mi.training.collection.sheet import encode_srgb
 from sira_mi.training.collection.skin import step
-from sira_mi.training.collection.surface import unit_eye, vertex_normals
+from sira_mi.training.collection.surface import unit_eye
+from sira_mi.training.collection.triangles import Places, connected_pieces, find_nearest, vertex_normals
 
 CENTIMETRES_PER_UNIT = 10.0
 SIZE_LIMIT = 200_000  # vertices
@@ -89,8 +88,7 @@ def _take_apart(path, mean, modes, triangles):
     triangles = triangles.astype(np.int64)
     mean = mean.astype(np.float64)
     ends = np.concatenate([triangles[:, :2], triangles[:, 1:]])
-    graph = sparse.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (len(mean), len(mean)))
-    _, label = connected_components(graph, directed=False)
+    label = connected_pieces(ends, len(mean))
     size = np.bincount(label)
     skin = size.argmax()
     eyes = []
@@ -135,8 +133,7 @@ def mark(basis: Basis, path: str) -> tuple[np.ndarray, Places, np.ndarray]:
     images, coverage = render_views(scene, np.array([intrinsic] * len(poses)), poses, settings, 0)
     marks = []
     for image, cover, pose in zip(images, coverage, poses, strict=True):
-        shown = linear_to_srgb(np.clip(image + 0.4 * (1 - cover[..., None]), 0, 1))
-        for face in find_faces(np.round(255 * shown).astype(np.uint8))[:1]:
+        for face in find_faces(encode_srgb(image + 0.4 * (1 - cover[..., None])))[:1]:
             marks.append(_trace(scene, basis, normals, face.landmarks, intrinsic, pose))
     number = np.isfinite(marks).all(-1).sum(0) if marks else np.zeros(LANDMARKS)
     valid = number > 0
@@ -144,7 +141,7 @@ def mark(basis: Basis, path: str) -> tuple[np.ndarray, Places, np.ndarray]:
         raise InputError(f"{path}: no face was found on renders of the mean; expected +y up and +z in front")
     middle = np.zeros((LANDMARKS, 3))
     middle[valid] = np.nanmedian(np.array(marks)[:, valid], axis=0)
-    places, landmarks, _ = nearest(middle, None, basis.mean, basis.skin, candidates=24)
+    places, landmarks, _ = find_nearest(middle, None, basis.mean, basis.skin, candidates=24)
     return landmarks, places, valid
 
 
@@ -161,7 +158,7 @@ def _trace(scene, basis, normals, pixels, intrinsic, pose):
     hit = scene.ray_intersect_preliminary(ray)
     distance = np.where(np.array(hit.is_valid()), np.array(hit.t), 0.0)
     points = inverse[:3, 3] + distance[:, None] * way
-    places, found, _ = nearest(points, None, basis.mean, basis.skin, candidates=24)
+    places, found, _ = find_nearest(points, None, basis.mean, basis.skin, candidates=24)
     facing = -(places.matrix(basis.skin, len(basis.mean)) @ normals * way).sum(1)
     seen = (np.linalg.norm(found - points, axis=1) < MARK_TOLERANCE) & (facing > MARK_COSINE)
     return np.where(seen[:, None], found, np.nan)

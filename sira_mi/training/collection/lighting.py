@@ -5,14 +5,17 @@ Maps are [H, 2H, 3] linear radiance in Mitsuba's frame: u = atan2(x, -z) / 2π, 
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import mitsuba as mi
 import numpy as np
-import OpenEXR
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.errors import InputError
+from sira_mi.sg.fit_environment import pixel_directions
+from sira_mi.sg.lights_io import read_environment
+from sira_mi.sg.lobes import evaluate_lobes
+from sira_mi.training.collection.render import point_towards
 
 MAP_HEIGHT = 128
 SKY_TURBIDITY = (2.0, 8.0)
@@ -23,10 +26,7 @@ BALANCE = (0.4, 1.0)
 @cache
 def map_directions(height: int) -> np.ndarray:
     """Unit directions [H, 2H, 3] of the pixel centres."""
-    v = (np.arange(height) + 0.5) / height
-    u = (np.arange(2 * height) + 0.5) / (2 * height)
-    phi, theta = np.meshgrid(2 * np.pi * u, np.pi * v)
-    return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
+    return pixel_directions(height, 2 * height)[0]
 
 
 def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndarray, dict]:
@@ -36,9 +36,10 @@ def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndar
     kinds = ("sg", "sky", "hdri") if hdri else ("sg", "sky")
     shares = (0.4, 0.2, 0.4) if hdri else (0.65, 0.35)
     kind = random.choice(kinds, p=shares)
+    info: dict[str, Any] = {"kind": "sg"}
     if kind == "sg":
         lobes = sample_lobes(random)
-        image, info = lobe_map(lobes), {"kind": "sg"}
+        image = lobe_map(lobes)
     elif kind == "sky":
         image, info = sky_map(random)
     else:
@@ -83,8 +84,8 @@ def sample_lobes(random: np.random.Generator) -> np.ndarray:
 
 
 def _lobe(random, yaw, elevation, sharpness, amplitude):
-    a, e = np.radians(random.uniform(*yaw)), np.radians(random.uniform(*elevation))
-    return np.concatenate([[np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)], [sharpness], amplitude])
+    towards = point_towards(np.radians(random.uniform(*yaw)), np.radians(random.uniform(*elevation)))
+    return np.concatenate([towards, [sharpness], amplitude])
 
 
 def _tint(random, strength):
@@ -96,20 +97,18 @@ def _tint(random, strength):
 
 def lobe_map(lobes: np.ndarray, height: int = MAP_HEIGHT) -> np.ndarray:
     """Radiance [H, 2H, 3] of lobes [N, 7]: the sum of amplitude · exp(sharpness (axis · direction − 1))."""
-    cosine = map_directions(height) @ lobes[:, :3].T
-    return np.exp(lobes[:, 3] * (cosine - 1)) @ lobes[:, 4:]
+    return evaluate_lobes(lobes, map_directions(height))
 
 
 def sky_map(random: np.random.Generator) -> tuple[np.ndarray, dict]:
     """Mitsuba's sun and sky with the sun mostly in front, over grey ground."""
     azimuth, elevation = random.uniform(-110, 110), random.uniform(12, 65)
     turbidity, sun = random.uniform(*SKY_TURBIDITY), random.uniform(0.0, 0.6) ** 2
-    a, e = np.radians(azimuth), np.radians(elevation)
-    towards = [np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)]
+    towards = point_towards(np.radians(azimuth), np.radians(elevation))
     emitter = mi.load_dict(
         {
             "type": "sunsky",
-            "sun_direction": [towards[0], -towards[2], towards[1]],
+            "sun_direction": [float(towards[0]), -float(towards[2]), float(towards[1])],
             "turbidity": float(turbidity),
             "sun_scale": 0.0,
             "albedo": 0.3,
@@ -125,32 +124,19 @@ def sky_map(random: np.random.Generator) -> tuple[np.ndarray, dict]:
     upper = image[directions[..., 1] > 0].mean(0)
     image[directions[..., 1] <= 0] = 0.2 * upper
     sharpness = 600.0
-    disk = np.exp(sharpness * (directions @ np.array(towards) - 1))
+    disk = np.exp(sharpness * (directions @ towards - 1))
     warm = np.array([1.0, 0.9 - 0.25 * np.exp(-elevation / 15), 0.8 - 0.55 * np.exp(-elevation / 15)])
     # Ratio of sun to sky irradiance: 0 overcast to about 6.
     strength = 18 * sun
     image += disk[..., None] * warm * strength * (upper @ np.array(LUMINANCE)) * np.pi / (2 * np.pi / sharpness)
-    info = {"kind": "sky", "azimuth": azimuth, "elevation": elevation, "turbidity": turbidity, "sun": strength}
-    return image, {key: value if isinstance(value, str) else float(value) for key, value in info.items()}
+    info = {"azimuth": azimuth, "elevation": elevation, "turbidity": turbidity, "sun": strength}
+    return image, {"kind": "sky", **{key: float(value) for key, value in info.items()}}
 
 
 @cache
 def read_map(path: Path) -> np.ndarray:
-    """An HDRI [128, 256, 3], area-averaged to the working size; Poly Haven's maps fit the frame as they are."""
-    try:
-        with OpenEXR.File(str(path)) as file:
-            channels = file.channels()
-            image = np.stack([_channel(channels, name) for name in "RGB"], axis=-1).astype(np.float32)
-    except Exception as error:
-        raise InputError(f"{path}: not a readable RGB environment map ({error})") from None
-    if not image.size or not np.isfinite(image).all():
-        raise InputError(f"{path}: not a finite RGB environment map")
-    return cv2.resize(np.maximum(image, 0), (2 * MAP_HEIGHT, MAP_HEIGHT), interpolation=cv2.INTER_AREA).astype(float)
+    """An HDRI [128, 256, 3], area-averaged to the working size. Maps of Poly Haven fit the frame as they are.
 
-
-def _channel(channels, name):
-    """One channel [H, W]; interleaved files group theirs under `RGB` or `RGBA`."""
-    for group in ("RGB", "RGBA"):
-        if group in channels:
-            return channels[group].pixels[..., "RGBA".index(name)]
-    return channels[name].pixels
+    Raises InputError for a file that is no finite latitude-longitude OpenEXR."""
+    size = (2 * MAP_HEIGHT, MAP_HEIGHT)
+    return cv2.resize(read_environment(path), size, interpolation=cv2.INTER_AREA).astype(float)

@@ -11,9 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.training.collection.render import Part, blocked_along
+from sira_mi.training.collection.render import Part, is_blocked_along
 from sira_mi.training.collection.skin import HAIR
 from sira_mi.training.collection.subject import BrokenHead
+from sira_mi.training.collection.triangles import closest_on_triangles, draw_barycentric, triangle_areas
 
 DIRECTIONS = 64
 SIGHTINGS = 3
@@ -51,9 +52,7 @@ def sample_parts(parts: list[Part], count: int, centre: np.ndarray, random: np.r
     areas, middles = [], []
     for part in parts:
         corners = part.vertices[part.triangles]
-        areas.append(
-            0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        )
+        areas.append(triangle_areas(corners))
         middles.append(corners.mean(1))
     area, middle = np.concatenate(areas), np.concatenate(middles)
     area = area * ((middle > lower - 0.1) & (middle < upper + 0.1)).all(1)
@@ -61,9 +60,7 @@ def sample_parts(parts: list[Part], count: int, centre: np.ndarray, random: np.r
     weight = area * np.where(face, 0.5 / max(area[face].sum(), 1e-9), 0.5 / max(area[~face].sum(), 1e-9))
     chosen = random.choice(len(weight), count, p=weight / weight.sum())
     bounds = np.cumsum([0] + [len(a) for a in areas])
-    a, b = random.random((2, count))
-    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
-    bary = np.stack([1 - a - b, a, b], axis=1)
+    bary = draw_barycentric(random, count)
     pieces = []
     for number, part in enumerate(parts):
         mine = (chosen >= bounds[number]) & (chosen < bounds[number + 1])
@@ -78,10 +75,11 @@ def sample_parts(parts: list[Part], count: int, centre: np.ndarray, random: np.r
         corners = part.vertices[corner]
         pieces.append((at(part.vertices), normals, part.region[triangle], at(part.albedo), at(part.specular), corners))
     samples = Samples(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
-    return samples.take(((samples.points > lower) & (samples.points < upper)).all(1))
+    inside = (samples.points > lower) & (samples.points < upper)
+    return samples.take(np.asarray(inside.all(1)))
 
 
-def seen_from_afar(scene: "mi.Scene", points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
+def is_seen_from_afar(scene: "mi.Scene", points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
     """Whether at least `SIGHTINGS` far directions reach a point, bool [N]; points on a surface are only asked in front
     of it."""
     sightings = np.zeros(len(points), int)
@@ -92,7 +90,7 @@ def seen_from_afar(scene: "mi.Scene", points: np.ndarray, normals: np.ndarray | 
         index = np.flatnonzero(ask)
         if len(index):
             origin = points[index] if normals is None else points[index] + 2e-3 * normals[index]
-            sightings[index] += ~blocked_along(scene, origin, direction)
+            sightings[index] += ~is_blocked_along(scene, origin, direction)
     return sightings >= SIGHTINGS
 
 
@@ -107,41 +105,12 @@ def smooth_hair_normals(samples: Samples) -> np.ndarray:
     return normals
 
 
-def point_triangle_distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distances [...] from points [..., 3] to triangles [..., 3, 3] (Ericson 2005, section 5.1.5)."""
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-
-    def dot(u, v):
-        return (u * v).sum(-1)
-
-    ab, ac, ap = b - a, c - a, points - a
-    bp, cp = points - b, points - c
-    d1, d2, d3, d4, d5, d6 = dot(ab, ap), dot(ac, ap), dot(ab, bp), dot(ac, bp), dot(ab, cp), dot(ac, cp)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    tiny = 1e-20
-    inner = np.maximum(va + vb + vc, tiny)
-    v, w = vb / inner, vc / inner
-    on_bc = (va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0)
-    t = (d4 - d3) / np.maximum(d4 - d3 + d5 - d6, tiny)
-    v, w = np.where(on_bc, 1 - t, v), np.where(on_bc, t, w)
-    on_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0)
-    v, w = np.where(on_ac, 0, v), np.where(on_ac, d2 / np.maximum(d2 - d6, tiny), w)
-    on_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
-    v, w = np.where(on_ab, d1 / np.maximum(d1 - d3, tiny), v), np.where(on_ab, 0, w)
-    for at, vv, ww in (
-        ((d1 <= 0) & (d2 <= 0), 0, 0),
-        ((d3 >= 0) & (d4 <= d3), 1, 0),
-        ((d6 >= 0) & (d5 <= d6), 0, 1),
-    ):
-        v, w = np.where(at, vv, v), np.where(at, ww, w)
-    closest = a + v[..., None] * ab + w[..., None] * ac
-    return np.linalg.norm(points - closest, axis=-1)
-
-
 def distance_to_surface(points: np.ndarray, outer: Samples, candidates: int = 8) -> np.ndarray:
     """Distances [Q] from points [Q, 3] to the triangles of the nearest samples of the outer surface."""
     _, near = cKDTree(outer.points).query(points, k=candidates)
-    return point_triangle_distance(points[:, None], outer.corners[near]).min(1)
+    weights = closest_on_triangles(points[:, None], outer.corners[near])
+    closest = np.einsum("nck,nckd->ncd", weights, outer.corners[near])
+    return np.linalg.norm(points[:, None] - closest, axis=-1).min(1)
 
 
 def choose_points(

@@ -11,7 +11,8 @@ from sira_mi.training.collection import skin
 from sira_mi.training.collection.look import Look, Traits, sample_look
 from sira_mi.training.collection.makehuman import identity_vertices, sample_identity
 from sira_mi.training.collection.render import Part
-from sira_mi.training.collection.surface import eye_spheres, unit_eye, vertex_normals
+from sira_mi.training.collection.surface import eye_spheres, unit_eye
+from sira_mi.training.collection.triangles import vertex_normals
 
 HAIR_SHARE = 0.7
 # Styles worn by one sex far more often than by the other, and styles that hide much of the face are drawn less often.

@@ -109,7 +109,7 @@ def specular_strength(vertices: np.ndarray, region: np.ndarray, landmarks: np.nd
     return np.clip(strength, 0.02, 1)
 
 
-def painted_part(surface: Surface, region: np.ndarray, landmarks: np.ndarray, scale: float, base: float) -> Part:
+def paint_part(surface: Surface, region: np.ndarray, landmarks: np.ndarray, scale: float, base: float) -> Part:
     """A part of a surface in the project's frame with the region codes [N] of its vertices."""
     codes = np.sort(region[surface.triangles], axis=1)[:, 1]
     return Part(
@@ -122,7 +122,7 @@ def painted_part(surface: Surface, region: np.ndarray, landmarks: np.ndarray, sc
     )
 
 
-def plain_part(surface: Surface, code: int = skin.SKIN) -> Part:
+def make_plain_part(surface: Surface, code: int = skin.SKIN) -> Part:
     """A part of one region, with its specular strength or that of skin."""
     return Part(
         surface.vertices,

@@ -12,12 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
+from scipy.sparse.linalg import SuperLU, splu
 
-from sira_mi.training.collection.surface import vertex_normals
+from sira_mi.training.collection.triangles import dot, find_nearest, undirected_edges, vertex_areas, vertex_normals
 
-CANDIDATES = 6
 # Cosine between normals under which a pair is dropped, and from which it counts fully.
 COMPATIBLE = (0.3, 0.75)
 LARGEST_COTANGENT = 8.0  # keeps slivers from stiffening the mesh
@@ -43,7 +41,7 @@ class Rows:
     source: sparse.csr_matrix  # [R, V] how the goals move with the target's vertices
     weights: np.ndarray  # [R] square scene units, the area a row stands for
 
-    def scaled(self, factor: float) -> "Rows":
+    def weigh(self, factor: float) -> "Rows":
         """The rows with their weights multiplied by a factor."""
         return replace(self, weights=factor * self.weights)
 
@@ -58,86 +56,6 @@ def stack(rows: list[Rows]) -> Rows:
     )
 
 
-@dataclass(frozen=True)
-class Places:
-    """Points on a triangle mesh."""
-
-    triangles: np.ndarray  # [N] triangle indices
-    weights: np.ndarray  # [N, 3] barycentric
-
-    def matrix(self, triangles: np.ndarray, count: int) -> sparse.csr_matrix:
-        """The matrix [N, count] that evaluates vertex values of the mesh `triangles` [T, 3] at the points."""
-        rows = np.repeat(np.arange(len(self.triangles)), 3)
-        columns = triangles[self.triangles].ravel()
-        return sparse.csr_matrix((self.weights.ravel(), (rows, columns)), (len(self.triangles), count))
-
-
-def closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Barycentric weights [..., 3] of the points of triangles [..., 3, 3] closest to points [..., 3]: the plane's foot
-    point if it lies inside, else the best of the three edges."""
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    u, v, w = b - a, c - a, points - a
-    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
-    wu, wv = _dot(w, u), _dot(w, v)
-    area = np.maximum(uu * vv - uv * uv, 1e-24)
-    s, t = (vv * wu - uv * wv) / area, (uu * wv - uv * wu) / area
-    best = np.stack([1 - s - t, s, t], axis=-1)
-    inside = (best >= 0).all(-1)
-    distance = np.where(inside, 0.0, np.inf)
-    for k in range(3):
-        start, end = corners[..., k, :], corners[..., (k + 1) % 3, :]
-        edge = end - start
-        along = np.clip(_dot(points - start, edge) / np.maximum(_dot(edge, edge), 1e-24), 0, 1)
-        gap = _dot(points - start - along[..., None] * edge, points - start - along[..., None] * edge)
-        nearer = ~inside & (gap < distance)
-        weights = np.zeros_like(best)
-        weights[..., k], weights[..., (k + 1) % 3] = 1 - along, along
-        best = np.where(nearer[..., None], weights, best)
-        distance = np.where(nearer, gap, distance)
-    return best
-
-
-def nearest(
-    points: np.ndarray,
-    normals: np.ndarray | None,
-    vertices: np.ndarray,
-    triangles: np.ndarray,
-    normal_weight: float = 0.0,
-    candidates: int = CANDIDATES,
-) -> tuple[Places, np.ndarray, np.ndarray]:
-    """The nearest points of a mesh to points [N, 3] with unit normals [N, 3]: their places, positions [N, 3], and the
-    cosines [N] between the normals of point and triangle (1 without normals). `candidates` triangles are tried for
-    each point, those with the nearest centroids in positions and `normal_weight`-scaled normals."""
-    corners = vertices[triangles]
-    centres, faces = corners.mean(1), _face_normals(corners)
-    if normals is None:
-        tree, query = cKDTree(centres), points
-    else:
-        tree = cKDTree(np.hstack([centres, normal_weight * faces]))
-        query = np.hstack([points, normal_weight * normals])
-    _, index = tree.query(query, k=candidates)
-    weights = closest_on_triangles(points[:, None], corners[index])
-    found = np.einsum("nck,nckd->ncd", weights, corners[index])
-    gap = ((found - points[:, None]) ** 2).sum(-1)
-    if normals is not None:
-        gap = gap + normal_weight**2 * ((faces[index] - normals[:, None]) ** 2).sum(-1)
-    pick = np.arange(len(points)), gap.argmin(1)
-    chosen = index[pick]
-    cosine = np.ones(len(points)) if normals is None else _dot(normals, faces[chosen])
-    return Places(chosen, weights[pick]), found[pick], cosine
-
-
-def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation [3, 3] and translation [3] that bring points [N, 3] to partners [N, 3] (Umeyama 1991): the
-    partner of x is near scale · rotation @ x + translation."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float((values * sign).sum() / (a**2).sum())
-    return scale, rotation, target.mean(0) - scale * rotation @ source.mean(0)
-
-
 def biharmonic(vertices: np.ndarray, quads: np.ndarray) -> sparse.csc_matrix:
     """The matrix [n, n] of the squared Laplacian integrated over a quad mesh: cotangent weights, averaged over both
     ways of splitting each quad, and lumped areas."""
@@ -148,7 +66,7 @@ def biharmonic(vertices: np.ndarray, quads: np.ndarray) -> sparse.csc_matrix:
     laplacian = sparse.csr_matrix((n, n))
     for k in range(3):
         i, j = first[:, (k + 1) % 3], first[:, (k + 2) % 3]
-        cotangent = _dot(corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]) / twice_area
+        cotangent = dot(corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]) / twice_area
         half = 0.25 * np.clip(cotangent, -LARGEST_COTANGENT, LARGEST_COTANGENT)
         laplacian = laplacian + sparse.csr_matrix(
             (
@@ -165,7 +83,7 @@ def biharmonic(vertices: np.ndarray, quads: np.ndarray) -> sparse.csc_matrix:
 class Solver:
     """The linear step: control displacements that balance rows against smoothness."""
 
-    factor: object  # LU of the normal matrix
+    factor: SuperLU  # LU of the normal matrix
     rows: Rows
 
     def displacement(self, residuals: np.ndarray) -> np.ndarray:
@@ -204,10 +122,11 @@ def register(problem: Problem, levels: Sequence[Level]) -> tuple[np.ndarray, Sol
     p = problem
     smooth = biharmonic(p.template, p.quads)
     normals = vertex_normals(p.target, p.target_triangles)
-    border = np.unique(border_edges(p.target_triangles))
+    ends, uses, _ = undirected_edges(p.target_triangles)
+    border = np.unique(ends[uses == 1])
     inner = np.setdiff1d(np.unique(p.target_triangles), border)
     pick_inner = sparse.identity(len(p.target), format="csr")[inner]
-    at_border = np.isin(p.target_triangles, border).any(1)
+    at_border = np.asarray(np.isin(p.target_triangles, border).any(1))
     active = np.flatnonzero(p.region > 0)
     area = (vertex_areas(p.refine @ p.template, p.triangles) * p.region)[active]
     target_area = vertex_areas(p.target, p.target_triangles)[inner]
@@ -216,37 +135,25 @@ def register(problem: Problem, levels: Sequence[Level]) -> tuple[np.ndarray, Sol
         for _ in range(level.iterations):
             surface = p.refine @ control
             points, facing = surface[active], vertex_normals(surface, p.triangles)[active]
-            places, goals, cosine = nearest(points, facing, p.target, p.target_triangles, level.normal_weight)
-            weights = area * _agreement(cosine, points - goals, level) * ~at_border[places.triangles]
+            places, goals, cosine = find_nearest(points, facing, p.target, p.target_triangles, level.normal_weight)
+            weights = area * _weigh_agreement(cosine, points - goals, level) * ~at_border[places.triangles]
             data = Rows(p.refine[active], goals, places.matrix(p.target_triangles, len(p.target)), weights)
-            feet, found, cosine = nearest(p.target[inner], normals[inner], surface, p.triangles, level.normal_weight)
+            feet, found, cosine = find_nearest(
+                p.target[inner], normals[inner], surface, p.triangles, level.normal_weight
+            )
             matrix = feet.matrix(p.triangles, len(surface))
-            weights = target_area * (matrix @ p.region) * _agreement(cosine, p.target[inner] - found, level)
+            weights = target_area * (matrix @ p.region) * _weigh_agreement(cosine, p.target[inner] - found, level)
             back = Rows((matrix @ p.refine).tocsr(), p.target[inner], pick_inner, weights)
-            rows = stack([data, back, p.pairs.scaled(level.pair_weight), p.anchors])
+            rows = stack([data, back, p.pairs.weigh(level.pair_weight), p.anchors])
             solver = linear_step(rows, smooth, level.stiffness)
             control = p.template + solver.displacement(rows.goals - rows.matrix @ p.template)
     return control, solver
 
 
-def _agreement(cosine, gap, level):
+def _weigh_agreement(cosine, gap, level):
     low, high = COMPATIBLE
     near = np.linalg.norm(gap, axis=1) < level.reach
     return np.clip((cosine - low) / (high - low), 0, 1) * near
-
-
-def border_edges(triangles: np.ndarray) -> np.ndarray:
-    """Edges [E, 2] with one triangle."""
-    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    edges, uses = np.unique(ends, axis=0, return_counts=True)
-    return edges[uses == 1]
-
-
-def vertex_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """A third of the adjacent triangles' area for every vertex [N]."""
-    corners = vertices[triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    return np.bincount(triangles.ravel(), np.repeat(area / 3, 3), len(vertices))
 
 
 def match_rings(source: np.ndarray, target: np.ndarray, along: np.ndarray) -> sparse.csr_matrix:
@@ -254,7 +161,7 @@ def match_rings(source: np.ndarray, target: np.ndarray, along: np.ndarray) -> sp
     same way round: both are split at their extremes in the direction `along` [3], and each half is matched by its share
     of arc length."""
     rows, columns, values = [], [], []
-    ends = [((c @ along).argmin(), (c @ along).argmax()) for c in (source, target)]
+    ends = [(int((c @ along).argmin()), int((c @ along).argmax())) for c in (source, target)]
     for first in (0, 1):
         (index, share), (curve, position) = (
             _half(c, e[first], e[1 - first]) for c, e in zip((source, target), ends, strict=True)
@@ -280,12 +187,3 @@ def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre [3] and radius of the least-squares sphere of points [N, 3]."""
     solution = np.linalg.lstsq(np.column_stack([2 * points, np.ones(len(points))]), (points**2).sum(1), rcond=None)[0]
     return solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
-
-
-def _face_normals(corners):
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-12)
-
-
-def _dot(a, b):
-    return (a * b).sum(-1)

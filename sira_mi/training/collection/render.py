@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -45,11 +46,14 @@ def sample_cameras(random: np.random.Generator, size: int) -> tuple[np.ndarray, 
     for yaw, pitch in angles:
         fov, distance = random.uniform(21, 27), random.uniform(12, 13)
         target = np.array([0.0, -0.45, 0.1]) + random.uniform(-0.15, 0.15, 3)
-        a, e = np.radians(yaw), np.radians(pitch)
-        away = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
         intrinsics.append(intrinsic_matrix(fov, size))
-        poses.append(look_at(target + distance * away, target))
+        poses.append(look_at(target + distance * point_towards(np.radians(yaw), np.radians(pitch)), target))
     return np.array(intrinsics, np.float32), np.array(poses, np.float32)
+
+
+def point_towards(yaw: float, pitch: float) -> np.ndarray:
+    """The unit direction [3] that is `yaw` from +z towards +x and `pitch` above the horizon, radians."""
+    return np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
 
 
 def intrinsic_matrix(fov: float, size: int) -> np.ndarray:
@@ -103,8 +107,8 @@ def mesh_of(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
     """A Mitsuba mesh of a part's surface with the attributes `vertex_albedo` and `vertex_specular`; `props` holds its
     BSDF."""
     mesh = mi.Mesh(name, len(part.vertices), len(part.triangles), has_vertex_normals=True, props=props)
-    mesh.add_attribute("vertex_albedo", 3, part.albedo.astype(np.float32).ravel())
-    mesh.add_attribute("vertex_specular", 1, part.specular.astype(np.float32).ravel())
+    for attribute, width, values in (("vertex_albedo", 3, part.albedo), ("vertex_specular", 1, part.specular)):
+        mesh.add_attribute(attribute, width, cast(Any, values.astype(np.float32).ravel()))  # the stubs ask for a list
     params = mi.traverse(mesh)
     params["vertex_positions"] = part.vertices.astype(np.float32).ravel()
     params["vertex_normals"] = part.normals.astype(np.float32).ravel()
@@ -115,7 +119,7 @@ def mesh_of(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
 
 def build_scene(parts: list[Part], light: np.ndarray, settings: RenderSettings) -> mi.Scene:
     """A Mitsuba scene of parts under a radiance map [H, 2H, 3]."""
-    scene = {f"part{i}": mitsuba_mesh(f"part{i}", part) for i, part in enumerate(parts)}
+    scene: dict[str, Any] = {f"part{i}": mitsuba_mesh(f"part{i}", part) for i, part in enumerate(parts)}
     scene["light"] = {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32)), "mis_compensation": False}
     scene["integrator"] = {"type": "path", "max_depth": settings.depth, "hide_emitters": True}
     return mi.load_dict({"type": "scene", **scene})
@@ -136,7 +140,8 @@ def render_views(
     x = mi.Float(pixel % size) + jitter.x
     y = mi.Float(pixel // size % size) + jitter.y
     ray = mi.RayDifferential3f(_camera_ray(intrinsics, poses, view, x, y))
-    radiance, valid, _ = scene.integrator().sample(scene, sampler, ray)
+    integrator: Any = scene.integrator()  # the stubs know no `sample`
+    radiance, valid, _ = integrator.sample(scene, sampler, ray)
     # A rare sample of `principled` at grazing angles is not a number; it counts as black.
     radiance = [dr.select(dr.isfinite(channel), channel, 0.0) for channel in radiance]
     channels = [*radiance, dr.select(valid, mi.Float(1), mi.Float(0))]
@@ -181,21 +186,21 @@ def _camera_ray(intrinsics, poses, view, x, y):
     return mi.Ray3f(mi.Point3f(*origin), dr.normalize(mi.Vector3f(*way)))
 
 
-def blocked_towards(scene: mi.Scene, origins: np.ndarray, target: np.ndarray) -> np.ndarray:
+def is_blocked_towards(scene: mi.Scene, origins: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Whether something lies between origins [N, 3] and a target [3], bool [N]."""
     way = target - origins
     distance = np.linalg.norm(way, axis=1)
-    return _blocked(scene, origins, way / distance[:, None], distance)
+    return _is_blocked(scene, origins, way / distance[:, None], distance)
 
 
-def blocked_along(scene: mi.Scene, origins: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def is_blocked_along(scene: mi.Scene, origins: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Whether something lies in a direction [3], however far, of origins [N, 3]; bool [N]."""
-    return _blocked(scene, origins, np.broadcast_to(direction, origins.shape), np.full(len(origins), 1e4))
+    return _is_blocked(scene, origins, np.broadcast_to(direction, origins.shape), np.full(len(origins), 1e4))
 
 
-def _blocked(scene, origins, directions, distances):
+def _is_blocked(scene, origins, directions, distances):
     ray = mi.Ray3f(_columns(origins), mi.Vector3f(_columns(directions)))
-    ray.maxt = mi.Float(distances.astype(np.float32))
+    ray.maxt = distances.astype(np.float32)
     return np.array(scene.ray_test(ray)).astype(bool)
 
 

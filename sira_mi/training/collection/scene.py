@@ -16,17 +16,17 @@ from sira_mi.training.collection.outer import (
     Samples,
     choose_points,
     distance_to_surface,
+    is_seen_from_afar,
     sample_parts,
-    seen_from_afar,
     smooth_hair_normals,
 )
 from sira_mi.training.collection.render import (
     RenderSettings,
-    blocked_along,
-    blocked_towards,
     build_scene,
     camera_position,
     exposure,
+    is_blocked_along,
+    is_blocked_towards,
     project,
     render_albedo,
     render_views,
@@ -81,7 +81,7 @@ def visible_colors(scene, samples: Samples, cameras, images: np.ndarray, coverag
         corner = np.floor(pixel - 0.5).astype(int)
         inside = (corner >= 0).all(1) & (corner[:, 0] < width - 1) & (corner[:, 1] < height - 1)
         index = np.flatnonzero(facing & inside)
-        blocked = blocked_towards(scene, samples.points[index] + 3e-3 * samples.normals[index], eye)
+        blocked = is_blocked_towards(scene, samples.points[index] + 3e-3 * samples.normals[index], eye)
         index = index[~blocked]
         x, y = corner[index].T
         fx, fy = (pixel[index] - 0.5 - corner[index]).T
@@ -114,7 +114,7 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
     cameras = sample_cameras(random, settings.render.size)
     images, coverage = render_views(scene, *cameras, settings.render, seed)
     wide = sample_parts(subject.parts, 4 * settings.points, nose, random)
-    wide = wide.take(np.flatnonzero(seen_from_afar(scene, wide.points, wide.normals)))
+    wide = wide.take(np.flatnonzero(is_seen_from_afar(scene, wide.points, wide.normals)))
     samples = choose_points(wide, nose, settings.points, settings.face_share, random)
     target = random.uniform(*settings.render.frontal_luminance) * metering(samples)
     scale = exposure(images[0], _head_weight(coverage[0], cameras), target)
@@ -131,7 +131,7 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
     near = near + settings.near_deviation * random.standard_normal((half, 3))
     volume = np.concatenate([uniform, np.clip(near, DOMAIN_LOWER, DOMAIN_UPPER)])
     distance = distance_to_surface(volume, wide)
-    distance = np.where(seen_from_afar(scene, volume, None), distance, -distance)
+    distance = np.where(is_seen_from_afar(scene, volume, None), distance, -distance)
 
     info = {
         "name": subject.name,
@@ -155,7 +155,7 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
         "volume": volume.astype(np.float32),
         "volume_distance": distance.astype(np.float32),
         "landmarks": landmarks.astype(np.float32),
-        "landmarks_valid": landmarks_valid & _landmarks_uncovered(scene, landmarks),
+        "landmarks_valid": landmarks_valid & _are_landmarks_uncovered(scene, landmarks),
         "albedo": samples.albedo.astype(np.float16),
         "specular": samples.specular.astype(np.float16),
         "albedo_images": albedo_images.astype(np.float16),
@@ -180,12 +180,12 @@ def _head_weight(coverage, cameras):
     return weight
 
 
-def _landmarks_uncovered(scene, landmarks):
+def _are_landmarks_uncovered(scene, landmarks):
     """Landmarks that nothing hides from the front or from either side of the front."""
     origin = landmarks + np.array([0, 0, 0.06])
     seen = np.zeros(len(landmarks), bool)
     for direction in ([0.0, 0, 1], [0.5, 0, 0.866], [-0.5, 0, 0.866], [0.9, 0, 0.44], [-0.9, 0, 0.44]):
-        seen |= ~blocked_along(scene, origin, np.array(direction))
+        seen |= ~is_blocked_along(scene, origin, np.array(direction))
     return seen
 
 

@@ -6,14 +6,13 @@ import numpy as np
 from PIL import Image
 
 from sira_mi.errors import InputError
+from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.build import load_scene
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """8-bit sRGB of linear values, clipped to 0..1."""
-    linear = np.clip(linear, 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255 * encoded).astype(np.uint8)
+    return np.round(255 * linear_to_srgb(linear)).astype(np.uint8)
 
 
 def contact_sheet(folder: Path, count: int = 24, columns: int = 6, views: tuple[int, ...] = (0,)) -> np.ndarray:

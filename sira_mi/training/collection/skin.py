@@ -11,7 +11,9 @@ from scipy import sparse
 
 from sira_mi.training.collection.look import Look
 from sira_mi.training.collection.makehuman import load_pack
-from sira_mi.training.collection.surface import head_surface, head_topology, refine_attribute, vertex_normals
+from sira_mi.training.collection.render import point_towards
+from sira_mi.training.collection.surface import head_surface, head_topology, refine_attribute
+from sira_mi.training.collection.triangles import vertex_normals
 
 SKIN, HAIR, EYE, CLOTH = 0, 1, 2, 3
 
@@ -198,7 +200,7 @@ def paint_eye(unit: np.ndarray, radius: float, look: Look) -> tuple[np.ndarray, 
     """Albedo [N, 3] and specular strength [N] of an eyeball given as unit directions [N, 3]: sclera, iris with a dark
     rim, pupil, all turned towards the gaze."""
     yaw, pitch = look.gaze
-    axis = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
+    axis = point_towards(yaw, pitch)
     angle = np.arccos(np.clip(unit @ axis, -1, 1))
     rim = np.arcsin(min(IRIS_RADIUS / radius, 0.95))
     turn = np.arctan2(unit[:, 1] - axis[1], unit[:, 0] - axis[0])

@@ -72,7 +72,8 @@ def head_topology() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     operator, quads = refinement()
     triangles = [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
     first = operator.shape[0]
-    source, centre = [], []
+    source: list[int] = []
+    centre: list[bool] = []
     for loop in border_loops(quads):
         ring = first + len(source) + np.arange(len(loop))
         source += [*loop, loop[0]]
@@ -109,7 +110,7 @@ def head_surface(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     below = refined[source].copy()
     below[:, 1] = BODY_FLOOR
     start = 0
-    for end in np.flatnonzero(centre):
+    for end in np.flatnonzero(centre).tolist():
         below[end] = below[start:end].mean(0)
         start = end + 1
     return np.concatenate([refined, below]), triangles
@@ -156,15 +157,3 @@ def unit_eye() -> tuple[np.ndarray, np.ndarray]:
     last = (len(polar) - 1) * EYE_SECTORS
     triangles.append(np.stack([np.full(EYE_SECTORS, back), last + after, last + sector], 1))
     return vertices, np.concatenate(triangles)
-
-
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted unit vertex normals [N, 3]."""
-    corners = vertices[triangles]
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    incidence = sparse.csr_matrix(
-        (np.ones(triangles.size), (triangles.ravel(), np.repeat(np.arange(len(triangles)), 3))),
-        (len(vertices), len(triangles)),
-    )
-    normals = incidence @ face
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from sira_mi.portrait.load import srgb_to_linear
-from sira_mi.training.collection.surface import BODY_FLOOR, vertex_normals
+from sira_mi.training.collection.surface import BODY_FLOOR
+from sira_mi.training.collection.triangles import connected_pieces, undirected_edges, vertex_normals
 
 TEXTURE_SIDE = 768  # pixels that textures are reduced to
 REFINED_TRIANGLES = 600_000  # where refinement stops
@@ -36,14 +35,6 @@ def place_index(vertices: np.ndarray) -> np.ndarray:
     size = max(float(np.ptp(vertices, axis=0).max()), 1e-30)
     x, y, z = np.rint((vertices - vertices.min(0)) / (SAME_PLACE * size)).astype(np.int64).T
     return np.unique((x << 40) + (y << 20) + z, return_inverse=True)[1].reshape(-1)
-
-
-def undirected_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The different edges [E, 2] of triangles [T, 3], the number of uses of each [E], and each triangle's edges 01, 12
-    and 20 among them [T, 3]."""
-    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    key, edge, uses = np.unique((ends[:, 0] << 32) + ends[:, 1], return_inverse=True, return_counts=True)
-    return np.stack([key >> 32, key & 0xFFFFFFFF], axis=1), uses, edge.reshape(-1, 3)
 
 
 def smooth_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -168,7 +159,7 @@ def close_borders(surface: Surface, lowest: float) -> Surface:
         outward = area / max(np.linalg.norm(area), 1e-12)
         n = len(rim)
         if max(a[:, 1].max(), b[:, 1].max()) < lowest:
-            below = [_dropped(corner, outward, float(a[:, 1].min())) for corner in (a, b)]
+            below = [_drop(corner, outward, float(a[:, 1].min())) for corner in (a, b)]
             new_vertices += [*below, below[0].mean(0, keepdims=True)]
             source += [rim[:, 0], rim[:, 1], rim[:1, 0]]
             start, end = count + np.arange(n), count + n + np.arange(n)
@@ -194,15 +185,9 @@ def close_borders(surface: Surface, lowest: float) -> Surface:
     )
 
 
-def _dropped(points, outward, bottom):
+def _drop(points, outward, bottom):
     """Points of a border on the floor; the top of a border that looks aside lies farther out there."""
     aside = outward * [1, 0, 1]
     on_floor = points + (points[:, 1:2] - bottom) * aside
     on_floor[:, 1] = BODY_FLOOR
     return on_floor
-
-
-def connected_pieces(edges: np.ndarray, count: int) -> np.ndarray:
-    """Number [count] of the connected piece that each of `count` vertices belongs to by edges [E, 2]."""
-    graph = sparse.csr_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (count, count))
-    return connected_components(graph, directed=False)[1]

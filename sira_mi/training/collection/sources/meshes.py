@@ -14,26 +14,27 @@ import trimesh
 from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import CHIN
 from sira_mi.portrait.load import srgb_to_linear
-from sira_mi.training.collection.annotation import Similarity, axis_turns, find_face, place
+from sira_mi.training.collection.annotation import axis_turns, find_face, place
 from sira_mi.training.collection.regions import (
     albedo_scale,
     classify,
     complete,
     head_edges,
-    painted_part,
-    plain_part,
+    make_plain_part,
+    paint_part,
     skin_specular,
 )
+from sira_mi.training.collection.similarity import Similarity
 from sira_mi.training.collection.subject import BrokenHead, Subject
 from sira_mi.training.collection.surface import BODY_FLOOR
 from sira_mi.training.collection.textured_surface import (
     Surface,
     close_borders,
-    connected_pieces,
     decode_texture,
     place_index,
     refine,
 )
+from sira_mi.training.collection.triangles import connected_pieces
 
 ENDINGS = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 LARGEST_FILE = 256 * 2**20  # bytes
@@ -68,15 +69,14 @@ class MeshSource:
     def subject(self, number: int, seed: int) -> Subject:
         path = self.files()[number]
         surfaces = read_surfaces(path)
-        rough = find_face([plain_part(s) for s in _coarse(surfaces)], axis_turns())
+        rough = find_face([make_plain_part(s) for s in _coarse(surfaces)], axis_turns())
         surfaces = [refine(replace(s, vertices=rough(s.vertices)), head_edges) for s in surfaces]
         still = Similarity(1.0, np.eye(3), np.zeros(3))
-        change, landmarks, valid, spread = place([plain_part(s) for s in surfaces], still, natural_size=False)
+        change, landmarks, valid, spread = place([make_plain_part(s) for s in surfaces], still, natural_size=False)
         frame = change.after(rough)
         marks = complete(landmarks, valid)
-        surfaces = [
-            refine(grounded(replace(s, vertices=change(s.vertices)), marks[CHIN, 1]), head_edges) for s in surfaces
-        ]
+        surfaces = [extend_to_floor(replace(s, vertices=change(s.vertices)), marks[CHIN, 1]) for s in surfaces]
+        surfaces = [refine(s, head_edges) for s in surfaces]
         everything = np.concatenate([s.vertices for s in surfaces])
         colours = np.concatenate([s.colours() for s in surfaces])
         offsets = np.cumsum([0] + [len(s.vertices) for s in surfaces])
@@ -84,7 +84,7 @@ class MeshSource:
         region = classify(everything, triangles, colours, marks)
         scale, base = albedo_scale(everything, colours, marks), skin_specular(seed)
         parts = [
-            painted_part(s, region[start:end], marks, scale, base)
+            paint_part(s, region[start:end], marks, scale, base)
             for s, start, end in zip(surfaces, offsets, offsets[1:], strict=False)
         ]
         description = {
@@ -100,7 +100,7 @@ class MeshSource:
         return Subject(self.title(number), parts, landmarks, valid, group, description, self.licence)
 
 
-def grounded(surface: Surface, chin: float) -> Surface:
+def extend_to_floor(surface: Surface, chin: float) -> Surface:
     """A surface in the project's frame, closed and continued down to the floor below the chin's height. One without
     lower border has its underside moved there."""
     lowest = float(surface.vertices[:, 1].min())

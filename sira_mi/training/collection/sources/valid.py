@@ -17,7 +17,7 @@ from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import CHIN
 from sira_mi.training.collection import hair as hairs
 from sira_mi.training.collection import skin
-from sira_mi.training.collection.annotation import Similarity, mean_eyes, place
+from sira_mi.training.collection.annotation import mean_eyes, place
 from sira_mi.training.collection.person import HAIR_SPECULAR, STRAND_RELIEF
 from sira_mi.training.collection.regions import (
     albedo_scale,
@@ -25,15 +25,16 @@ from sira_mi.training.collection.regions import (
     complete,
     face_mask,
     head_edges,
-    painted_part,
-    plain_part,
+    make_plain_part,
+    paint_part,
     skin_specular,
 )
 from sira_mi.training.collection.render import Part
+from sira_mi.training.collection.similarity import Similarity
 from sira_mi.training.collection.sources.meshes import LARGEST_TEXTURE, MOST_TRIANGLES
 from sira_mi.training.collection.subject import BrokenHead, Subject
-from sira_mi.training.collection.surface import vertex_normals
 from sira_mi.training.collection.textured_surface import Surface, close_borders, decode_texture, refine, sample_texture
+from sira_mi.training.collection.triangles import draw_barycentric, triangle_areas, vertex_normals
 
 UNITS_PER_METRE = 10.0
 LARGEST_ARRAYS = 128 * 2**20  # bytes unpacked
@@ -77,7 +78,10 @@ class ValidSource:
         body = replace(surfaces[BODY], vertices=lower_arms(surfaces[BODY].vertices))
         body = refine(close_borders(body, mean_eyes()[1] - 1.2), head_edges)
         small = {n: refine(surfaces[n], lambda m: np.full(len(m), EYE_EDGE)) for n in EYES + GLANDS}
-        parts = [plain_part(body), *(plain_part(small[n], skin.EYE if n in EYES else skin.SKIN) for n in small)]
+        parts = [
+            make_plain_part(body),
+            *(make_plain_part(small[n], skin.EYE if n in EYES else skin.SKIN) for n in small),
+        ]
         wig = wig_part(surfaces[WIG], random) if WIG in surfaces else None
         still = Similarity(1.0, np.eye(3), np.zeros(3))
         frame, landmarks, valid, spread = place([*parts, *([wig] if wig else [])], still, natural_size=True)
@@ -87,11 +91,11 @@ class ValidSource:
         colours = body.colours()
         scale, base = albedo_scale(body.vertices, colours, marks), skin_specular(seed)
         region = classify(body.vertices, body.triangles, colours, marks)
-        head = painted_part(body, region, marks, scale, base)
-        others = frame.moved(parts[1:])
+        head = paint_part(body, region, marks, scale, base)
+        others = frame.move(parts[1:])
         others = [replace(part, albedo=np.clip(part.albedo * scale, 0.004, 0.9)) for part in others]
         if wig is not None:
-            (wig,) = frame.moved([wig])
+            (wig,) = frame.move([wig])
             wig = replace(wig, albedo=np.clip(wig.albedo * scale, 0.004, 0.9))
             head = _shade_scalp(head, wig, region, marks)
             others.append(wig)
@@ -196,6 +200,7 @@ def wig_part(wig: Surface, random: np.random.Generator) -> Part:
     relief = STRAND_RELIEF * (0.7 * fine + coarse)
     vertices = vertices + np.clip(relief, -0.05, 0.05)[:, None] * normals
     near = cKDTree(points).query(vertices, k=3)[1]
+    assert wig.texture is not None  # `read_avatar` reads one
     albedo = sample_texture(wig.texture, uv)[near].mean(1) * np.exp(0.12 * fine + 0.1 * coarse)[:, None]
     return Part(
         vertices,
@@ -210,11 +215,9 @@ def wig_part(wig: Surface, random: np.random.Generator) -> Part:
 def scatter(surface: Surface, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Points [S, 3] about `spacing` apart on a surface, and their texture coordinates [S, 2]."""
     corners = surface.vertices[surface.triangles]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = triangle_areas(corners)
     triangle = np.repeat(np.arange(len(area)), random.poisson(area / spacing**2) + 1)
-    a, b = random.random((2, len(triangle)))
-    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
-    bary = np.stack([1 - a - b, a, b], axis=1)
+    bary = draw_barycentric(random, len(triangle))
     texture = surface.uv[surface.triangles][triangle]
     return np.einsum("sk,skd->sd", bary, corners[triangle]), np.einsum("sk,skd->sd", bary, texture)
 
