@@ -21,7 +21,7 @@ from sira_mi.training.scenes import TrainingScene, load_scene
 from sira_mi.training.train import APPEARANCE_TERMS, train_appearance
 from studies.cache import fingerprint, load_or_compute, read
 from studies.measures import spread_indices
-from studies.priors import appearance_measures as measures_of
+from studies.priors import appearance_measures
 from studies.priors.appearance_measures import HeldOut, LatentFit
 from studies.priors.shape_measures import manifest_entries
 from studies.priors.short_trainings import COMPLETE, read_model, seconds, training_scenes
@@ -62,18 +62,21 @@ def measure_appearance_prior(collection: Path, runs: Path, measures: AppearanceM
         scores = score_prior(prior, collection, held_out, scenes, z_sdf, measures.fit)
         imaged = spread_indices(len(held_out), measures.imaged)
         views = {
-            k: measures_of.render_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k]) for k in imaged
+            k: appearance_measures.render_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k])
+            for k in imaged
         }
-        images = [measures_of.image_scores(views[k], held_out[k], scores["baseline"]) for k in imaged]
+        images = [appearance_measures.image_scores(views[k], held_out[k], scores["baseline"]) for k in imaged]
         shown = [imaged[k] for k in spread_indices(len(imaged), measures.pictured)]
-        write_png(picture, measures_of.appearance_sheet([held_out[k] for k in shown], [views[k][0] for k in shown]))
+        write_png(
+            picture, appearance_measures.appearance_sheet([held_out[k] for k in shown], [views[k][0] for k in shown])
+        )
         return {
             "scans": len(held_out),
             "imaged": len(imaged),
-            "points": measures_of.mean_scores(scores["rows"]),
-            "images": measures_of.mean_scores(images),
-            "by_source": measures_of.mean_scores_by(held_out, scores["rows"], "source"),
-            "by_group": measures_of.mean_scores_by(held_out, scores["rows"], "group"),
+            "points": appearance_measures.mean_scores(scores["rows"]),
+            "images": appearance_measures.mean_scores(images),
+            "by_source": appearance_measures.mean_scores_by(held_out, scores["rows"], "source"),
+            "by_group": appearance_measures.mean_scores_by(held_out, scores["rows"], "group"),
             "training": _training_scores(prior, collection, runs, measures.training_scenes),
             "fit": asdict(measures.fit),
             "seconds": round(monotonic() - start, 1),
@@ -94,11 +97,11 @@ def score_prior(
     `rows`."""
     train = manifest_entries(collection, "train")
     chosen = [train[k] for k in spread_indices(len(train), _BASELINE_SCENES)]
-    baseline = measures_of.training_baseline([_load(collection, entry) for entry in chosen])
-    latents = measures_of.fit_appearance_latents(prior, scenes, z_sdf, AppearanceTraining(), fit)
+    baseline = appearance_measures.training_baseline([_load(collection, entry) for entry in chosen])
+    latents = appearance_measures.fit_appearance_latents(prior, scenes, z_sdf, AppearanceTraining(), fit)
     rows = [
-        measures_of.render_scores(prior, _column(latents, k), z_sdf[:, k], scan)
-        | measures_of.point_scores(prior, _column(latents, k), z_sdf[:, k], scan, baseline)
+        appearance_measures.render_scores(prior, _column(latents, k), z_sdf[:, k], scan)
+        | appearance_measures.point_scores(prior, _column(latents, k), z_sdf[:, k], scan, baseline)
         for k, scan in enumerate(held_out)
     ]
     return {"latents": latents, "baseline": baseline, "rows": rows}
@@ -124,7 +127,7 @@ def _ablation(collection: Path, runs: Path, without: str | None, steps: int, sca
         held_out, scenes, z_sdf = _test_scans(collection, runs / "evidence", scans)
         prior = load_avatar(run / "prior.safetensors")
         rows = score_prior(prior, collection, held_out, scenes, z_sdf, LatentFit())["rows"]
-        scores = measures_of.mean_scores(rows)
+        scores = appearance_measures.mean_scores(rows)
         return {"name": name, "steps": steps, "scans": len(held_out), **scores, "seconds": seconds(run, "appearance")}
 
     key = fingerprint(_VERSION, run / "prior.safetensors", collection / "manifest.json", str(scans))
@@ -151,11 +154,11 @@ def _training_scores(prior: Avatar, collection: Path, runs: Path, count: int) ->
     appearance, _ = read_parameters(runs / "appearance.checkpoint")
     mean, spread = whitening(shape["z_sdf"])
     z_sdf = (np.linalg.pinv(spread) @ (shape["z_sdf"] - mean[:, None])).astype(np.float32)
-    latents = measures_of.training_latents(appearance)
+    latents = appearance_measures.training_latents(appearance)
     entries = manifest_entries(collection, "train")
-    return measures_of.mean_scores(
+    return appearance_measures.mean_scores(
         [
-            measures_of.render_scores(prior, _column(latents, k), z_sdf[:, k], _load(collection, entries[k]))
+            appearance_measures.render_scores(prior, _column(latents, k), z_sdf[:, k], _load(collection, entries[k]))
             for k in spread_indices(len(entries), count)
         ]
     )
@@ -164,7 +167,7 @@ def _training_scores(prior: Avatar, collection: Path, runs: Path, count: int) ->
 def _load(collection: Path, entry: dict) -> HeldOut:
     group = entry.get("group") or {}
     path = collection / Path(entry["file"]).name
-    held_out = measures_of.load_held_out(path, str(entry.get("source", "")), str(group.get("ancestry", "")))
+    held_out = appearance_measures.load_held_out(path, str(entry.get("source", "")), str(group.get("ancestry", "")))
     return dataclasses.replace(held_out, name=path.name)
 
 
