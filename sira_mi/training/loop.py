@@ -74,18 +74,19 @@ def run_training(
     picture: Callable[[Path, dict[str, np.ndarray]], None] | None = None,
     picture_steps: int = 1000,
 ) -> dict[str, np.ndarray]:
-    """Runs `step_function(step)`, which returns the unweighted loss terms, until `steps`, from the checkpoint
-    `folder/name.checkpoint` if there is one, and returns the parameters.
+    """Runs `step_function(step)`, which takes a step and returns the unweighted loss terms, `steps` times, or on from
+    the checkpoint `folder/name.checkpoint`. Returns the parameters.
 
-    Written are: every hundred steps a line of mean terms and of seconds to `folder/name.log`; every `picture_steps`
-    steps and at the end, by `picture(path, parameters)`, `folder/pictures/name_STEP.png`, unless pictures have already
-    taken 2% of the time; every half minute the checkpoint, unless the loss has risen. `weights` are the λ of the terms
-    (1 where missing). `description` is stored in the checkpoint and has to be the same on a resume; its values are
-    JSON objects.
+    It writes to `folder`: the checkpoint every half minute, unless the loss has risen; a line of `name.log` every
+    hundred steps, with mean terms and seconds; `pictures/name_STEP.png`, by `picture(path, parameters)`, every
+    `picture_steps` steps and at the end, unless pictures have taken 2% of the time already.
 
-    A step depends only on its number and the optimizer's state, so a resumed run repeats the uninterrupted one. Raises
-    InputError when the loss stops being finite, or when its median over a hundred steps is more than three times the
-    best such median; the checkpoint is then the last from before the rise."""
+    `weights` are the λ of the terms, 1 where missing. `description`, whose values are JSON objects, is stored in the
+    checkpoint and has to be the same on a resume. A step depends only on its number and the optimizer's state, so a
+    run that resumes repeats one without interruption.
+
+    Raises InputError when a term stops being finite, or when the loss's median over a hundred steps is more than three
+    times the best such median. The checkpoint is then the last one from before the rise."""
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint, log = folder / f"{name}.checkpoint", folder / f"{name}.log"
     description, weights = dict(description or {}), weights or {}
@@ -108,6 +109,7 @@ def run_training(
                 f"{name}: the training diverges at step {step}, its loss is {watch.ratio:.1f} times its best "
                 f"({shown}); lower the learning rate; {checkpoint} is from before that"
             )
+
         totals.append(terms)
         done, now = step + 1, time.monotonic()
         if done % 100 == 0:
@@ -116,10 +118,12 @@ def run_training(
                 file.write(json.dumps({"step": done, **means, "seconds": round(now - logged, 2)}) + "\n")
             progress.set_postfix({k: f"{v:.4f}" for k, v in list(means.items())[:3]})
             totals, logged = [], now
+
         if done == steps or (now - saved > _CHECKPOINT_SECONDS and watch.sound):
             metadata = {"step": str(done), "best": repr(watch.best), **description}
             write_arrays(checkpoint, optimizer_state(optimizer), metadata)
             saved = now
+
         due = done == steps or (done % picture_steps == 0 and drawing <= _PICTURE_SHARE * (now - began))
         if picture is not None and due:
             (folder / "pictures").mkdir(exist_ok=True)

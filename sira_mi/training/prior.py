@@ -21,9 +21,9 @@ def whitening(latents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def whiten(architecture, name: str, network: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Network parameters that take a standard normal latent z for what `mean + spread z` was. A latent that shifts
-    hidden layers: in each of them Z mean is added to the bias, and Z spread takes the place of Z. A latent that is the
-    network's input (the illumination decoder's): the same in the first layer, with its weights."""
+    """Parameters of the network with a standard normal latent code w in place of z = mean + spread w. In every layer
+    that z shifts by Z z, Z mean is added to the bias and Z spread replaces Z. The illumination decoder has z as its
+    input; there the same is done with the weights of the first layer."""
     flat, offset = network.copy(), 0
     for k, (weight, bias, latent) in enumerate(architecture.networks[name].shapes()):
         start_bias = offset + weight[0] * weight[1]
@@ -51,9 +51,9 @@ def assemble_prior(
     settings: af_sm.AppearanceTraining,
     seed: int,
 ) -> Avatar:
-    """The mean head of both trained models. All latents become standard normal: the zero latent is the mean of the
-    trained ones [dim, scenes], a sample of N(0, I) a head at 1σ. The light is the mean light, the refinement
-    starts at zero and is switched off; `landmarks` [scenes, 468, 3] are averaged over the scenes that have them.
+    """The mean head of both trained models. All latent codes become standard normal: 0 is the mean of the trained ones
+    [dim, scenes]. The light is the mean light. The refinement starts at zero and is switched off. `landmarks`
+    [scenes, 468, 3] are averaged over the scenes that have them.
     Roughness and the prior on skin are those of the appearance's `settings`."""
     owners = {
         "z_sdf": "deformation",
