@@ -61,10 +61,10 @@ def measure_appearance_prior(collection: Path, runs: Path, measures: AppearanceM
         held_out, scenes, z_sdf = _test_scans(collection, evidence, measures.scans)
         scores = score_prior(prior, collection, held_out, scenes, z_sdf, measures.fit)
         imaged = spread_indices(len(held_out), measures.imaged)
-        views = {
-            k: appearance_measures.render_views(prior, _column(scores["latents"], k), z_sdf[:, k], held_out[k])
-            for k in imaged
-        }
+        views = {}
+        for k in imaged:
+            latents = _column(scores["latents"], k)
+            views[k] = appearance_measures.render_views(prior, latents, z_sdf[:, k], held_out[k])
         images = [appearance_measures.image_scores(views[k], held_out[k], scores["baseline"]) for k in imaged]
         shown = [imaged[k] for k in spread_indices(len(imaged), measures.pictured)]
         write_png(
