@@ -174,6 +174,15 @@ class SiraSG(mi.SamplingIntegrator):
         refinement = {} if self.refinement is None else {"light_refinement": 3}
         return {name: channel_count(name) for name in names} | refinement
 
+    def select_lobes(self, lobes):
+        """Those of `lobes` [N_l, 7] that the closed form sums over. Raises InputError for an index that they lack."""
+        chosen, count = self.shaded_lobes, lobes.shape[0]
+        if chosen is None:
+            return lobes
+        if not (len(chosen) and ((chosen >= 0) & (chosen < count)).all()):
+            raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
+        return mi.TensorXf(np.ascontiguousarray(lobes.numpy()[chosen]))
+
     def aov_names(self):
         return extra_channel_names() if self.aovs else []
 
@@ -257,7 +266,7 @@ class HeadShader:
         self.bsdf, self.field = head.bsdf(), head.field()
         self.specular_term = attached or self.bsdf.k_s.numpy().item() != 0
         self.lobes = local_lobes(light, head)
-        self.shaded_lobes = self.lobes if attached else self._select_lobes()
+        self.shaded_lobes = self.lobes if attached else integrator.select_lobes(self.lobes)
         self.directions: Directions | None = None
         if integrator.visibility:
             self.directions = light_directions(dr.detach(self.lobes).numpy(), integrator.directions)
@@ -323,15 +332,6 @@ class HeadShader:
         si.p = self.head.to_world @ from_columns(x, mi.Point3f)
         value = texture.eval(si) if rows == 3 else texture.eval_1(si)
         return to_columns(value + dr.zeros(mi.Float, x.shape[1]))
-
-    def _select_lobes(self):
-        """The lobes [N_l, 7] that the closed form sums over."""
-        chosen, count = self.integrator.shaded_lobes, self.lobes.shape[0]
-        if chosen is None:
-            return self.lobes
-        if not (len(chosen) and ((chosen >= 0) & (chosen < count)).all()):
-            raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
-        return mi.TensorXf(np.ascontiguousarray(self.lobes.numpy()[chosen]))
 
 
 def mesh_albedos(head, bsdf, si, x) -> list:

@@ -448,6 +448,6 @@ def test_numbers_of_lobes_are_checked():
     for numbers in ([5], [-1], [0, 7]):
         integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array(numbers, np.float32))})
         with pytest.raises(InputError, match="numbers of lobes"):
-            integrator._shaded(mi.TensorXf(LOBES))
+            integrator.select_lobes(mi.TensorXf(LOBES))
     integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array([2, 0], np.float32))})
-    np.testing.assert_array_equal(integrator._shaded(mi.TensorXf(LOBES)).numpy(), LOBES[[2, 0]])
+    np.testing.assert_array_equal(integrator.select_lobes(mi.TensorXf(LOBES)).numpy(), LOBES[[2, 0]])
