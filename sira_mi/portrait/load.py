@@ -14,6 +14,7 @@ import OpenEXR
 from PIL import Image, ImageCms
 
 from sira_mi.errors import InputError
+from sira_mi.files import read_exr
 
 MIN_SIDE = 32  # pixels; anything smaller holds no face that could be fitted
 MAX_FILE_PIXELS = 400_000_000
@@ -315,20 +316,7 @@ def _load_exr(path: Path, max_pixels: int) -> Photo:
     except Exception:  # OpenEXR raises bare RuntimeError and others
         raise InputError(f"{path} is not an EXR that can be read: export it again") from None
     _check_size(path, width, height)
-    try:
-        channels = {k: c.pixels for k, c in OpenEXR.File(str(path), separate_channels=True).channels().items()}
-    except Exception:
-        raise InputError(f"{path} is damaged or truncated: export it again") from None
-    names = next((n for n in ("RGB", "Y") if all(c in channels for c in n)), None)
-    if names is None or ("RY" in channels and names == "Y"):
-        raise InputError(f"{path} has no R, G and B channels, only {', '.join(sorted(channels))}: export it as RGB")
-    planes = [np.asarray(channels[c], np.float32) for c in (names if len(names) == 3 else names * 3)]
-    if any(plane.shape != (height, width) for plane in planes):
-        raise InputError(f"{path} has subsampled channels: export it as full RGB")
-    image = np.stack(planes, axis=-1)
-    if not np.isfinite(image).all():
-        raise InputError(f"{path} contains NaN or infinite pixels: mend it first")
-    alpha = channels.get("A")
+    image, alpha = read_exr(path)
     factor = _reduction(width, height, max_pixels)
     image = _block_mean(image[: height // factor * factor, : width // factor * factor], factor)
     if alpha is not None:

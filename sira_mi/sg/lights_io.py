@@ -8,10 +8,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 
 from sira_mi.errors import InputError
-from sira_mi.files import write_through
+from sira_mi.files import read_exr, write_through
 
 MAXIMUM_LOBES = 4096
 # Width and height of an environment image that is still read.
@@ -91,21 +90,8 @@ def read_environment(path: str | Path) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:
-        raise InputError(f"{path}: not a readable OpenEXR image") from error
-    names = ("R", "G", "B") if {"R", "G", "B"} <= channels.keys() else ("Y", "Y", "Y")
-    if names[0] not in channels:
-        raise InputError(f"{path}: no channels R, G, B or Y")
-    planes = [np.asarray(channels[name]) for name in names]
-    height, width = planes[0].shape
-    if any(plane.shape != (height, width) for plane in planes) or max(height, width) > _MAXIMUM_SIDE:
-        raise InputError(f"{path}: subsampled channels or an unreasonable size of {width} × {height}")
-    if height < 2 or not 1.8 <= width / height <= 2.2:
+    image, _ = read_exr(path)
+    height, width = image.shape[:2]
+    if max(height, width) > _MAXIMUM_SIDE or height < 2 or not 1.8 <= width / height <= 2.2:
         raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
-    image = np.stack(planes, axis=-1).astype(np.float32)
-    if not np.isfinite(image).all():
-        raise InputError(f"{path}: holds values that are not finite")
     return np.maximum(image, 0.0)
