@@ -20,7 +20,6 @@ class Decision:
     left_out: bool
     reason: str  # the condition, and what was found
     bound: float = 0.0  # of the error
-    built_in: bool = False  # always left out; nothing switches it off
     changes: Mapping[str, Any] = field(default_factory=dict)  # the settings that carry it out
     error: float | None = None  # measured: root mean square over the head's pixels, or largest over the gradient
     noise: float | None = None  # of the measured error: the difference between two seeds of one picture
@@ -44,12 +43,9 @@ class Plan:
         return any(d.left_out for d in self.decisions if (d.name, d.where) == (name, where))
 
     def keep_all(self) -> Plan:
-        """The plan that leaves out only what is built in."""
+        """The plan that leaves out nothing."""
         return Plan(
-            tuple(
-                replace(d, left_out=False, reason=f"kept; {d.reason}") if d.left_out and not d.built_in else d
-                for d in self.decisions
-            )
+            tuple(replace(d, left_out=False, reason=f"kept; {d.reason}") if d.left_out else d for d in self.decisions)
         )
 
     def apply(self, settings):
@@ -70,7 +66,7 @@ def explain(plan: Plan) -> str:
     width = max(len(f"{d.name} ({d.where})") for d in plan.decisions)
     lines = []
     for d in plan.decisions:
-        verdict = "built in" if d.built_in and d.left_out else "left out" if d.left_out else "needed"
+        verdict = "left out" if d.left_out else "needed"
         lines.append(f"{verdict:8}  {f'{d.name} ({d.where})':{width}}  {d.reason}{_format_figures(d)}")
     return "\n".join(lines)
 

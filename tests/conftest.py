@@ -17,7 +17,8 @@ from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LANDMARKS
 from sira_mi.fields.mlp import Architecture, initial_parameters
-from sira_mi.fit.settings import QUALITIES, FitSettings
+from sira_mi.fit.settings import QUALITIES
+from sira_mi.fit.stage import FitSettings
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.face import find_faces
 
@@ -63,7 +64,7 @@ def variant():
 
 def tiny_fit(steps: int) -> FitSettings:
     """A fit of `steps` steps a stage: every stage and every file is real, only too short to look good."""
-    stages = tuple((kind, dataclasses.replace(stage, steps=steps)) for kind, stage in QUALITIES["standard"].stages)
+    stages = tuple(dataclasses.replace(stage, steps=steps) for stage in QUALITIES["standard"].stages)
     sizes = {"working_size": 128, "rays": 256, "points": 64, "pixels": 256, "voxel": 0.16, "final_voxel": 0.12}
     return FitSettings("tiny", **sizes, stages=stages, block=3)
 

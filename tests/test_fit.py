@@ -4,6 +4,8 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -17,8 +19,12 @@ from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
+from sira_mi.fit.memory import peak_memory
 from sira_mi.fit.rays import modelled_pixels, pixel_rays
+from sira_mi.fit.refinement import AlbedoRefinementStage
+from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.portrait import Portrait
 
 TINY = tiny_fit(steps=6)
 
@@ -52,9 +58,9 @@ def test_output_folder_is_complete_and_consistent(finished):
     """Every file that the README promises is there, at the photo's working resolution, and opens."""
     report = json.loads((finished / "avatar.json").read_text())
     assert report["complete"] and report["psnr_inside_mask_db"] > 8
-    assert set(report["losses"]) == {stage.name for _, stage in TINY.stages}
+    assert set(report["losses"]) == {stage.name for stage in TINY.stages}
     left_out = {(d["name"], d["where"]) for d in report["plan"] if d["left_out"]}
-    assert {("speculars", "light"), ("refinement", "light")} < left_out
+    assert {("specular term", "light"), ("base albedo at every step", "refinement")} < left_out
     assert set(report["seconds"]) >= {"portrait", "latents", "refinement", "output", "total"}
     size = (128, 128)
     assert Image.open(finished / "input.png").size == size
@@ -153,13 +159,49 @@ def test_interrupt_writes_what_there_is(fit, tmp_path, monkeypatch):
 def test_checkpoint_of_another_fit_is_refused(tmp_path):
     """A checkpoint goes on only with the photo, settings, seed and prior that it was made with."""
     path = tmp_path / "checkpoint.safetensors"
-    save_progress(path, Progress({"z_sdf": np.zeros(3, np.float32)}, step=5, seconds={}, losses={}), "this fit")
-    assert load_progress(path, "this fit").step == 5
+    state = FitState({"z_sdf": np.ones(3, np.float32)}, unpolished={"z_sdf": np.zeros(3, np.float32)})
+    save_progress(path, Progress(state, step=5, seconds={}, losses={}), "this fit")
+    loaded = load_progress(path, "this fit")
+    assert loaded.step == 5 and loaded.optimizer is None and loaded.state.albedo_shares is None
+    for before, after in ((state, loaded.state), (state.before_polish(), loaded.state.before_polish())):
+        assert np.array_equal(before.avatar["z_sdf"], after.avatar["z_sdf"]) and np.array_equal(before.pose, after.pose)
     with pytest.raises(InputError, match="another photo"):
         load_progress(path, "that fit")
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(InputError, match="checkpoint"):
         load_progress(path, "this fit")
+
+
+def test_a_fit_is_identified_by_all_that_it_depends_on(fit, tmp_path, monkeypatch):
+    """Settings and types of stages, seed, photo, version of the package and variant of Mitsuba."""
+    from sira_mi.fit.fit import identify
+    from sira_mi.fit.stage import FitTask
+
+    nothing = np.full((468, 2), np.nan)
+    photo = Portrait(np.zeros((4, 4, 3), np.float32), np.ones((4, 4), np.float32), nothing, nothing, _camera(), ())
+    task = FitTask(photo, load_avatar(), PRIOR, TINY, tmp_path, TINY.plan())
+    brighter = replace(task, portrait=replace(photo, image=photo.image + 1))
+    *others, refinement = TINY.stages
+    paper = AlbedoRefinementStage(**{f.name: getattr(refinement, f.name) for f in fields(refinement)})
+    tasks = (task, brighter, replace(task, settings=replace(TINY, stages=(*others, paper))))
+    identities = [identify(one, seed=0) for one in tasks] + [identify(task, seed=1)]
+    monkeypatch.setattr("sira_mi.__version__", "0.0.0")
+    identities.append(identify(task, seed=0))
+    mi.set_variant("scalar_rgb")
+    identities.append(identify(task, seed=0))
+    mi.set_variant("llvm_ad_rgb")
+    assert len(set(identities)) == len(identities) and identify(task, seed=0) == identities[4]
+
+
+def test_peak_memory_is_known_without_posix(monkeypatch):
+    """In bytes; on Windows, which has no `resource`, by psutil."""
+    block = np.ones(1 << 25)
+    assert block.nbytes < peak_memory() < 1 << 40
+    process = SimpleNamespace(memory_info=lambda: SimpleNamespace(peak_wset=123))
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(sys.modules, "resource", None)
+    monkeypatch.setitem(sys.modules, "psutil", SimpleNamespace(Process=lambda: process))
+    assert peak_memory() == 123
 
 
 def _camera() -> Camera:

@@ -4,7 +4,7 @@ import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
 # isort: split
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -20,8 +20,9 @@ from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fit import driver
 from sira_mi.fit.__main__ import main
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
-from sira_mi.fit.fit import FitRequest, fit_portrait, initial_tensors, read_portrait
-from sira_mi.fit.settings import Stage
+from sira_mi.fit.fit import FitRequest, fit_portrait, read_portrait
+from sira_mi.fit.stage import FitTask, Problem, Stage
+from sira_mi.fit.state import FitState, initial_state
 from sira_mi.optimisation.adam import adam
 from sira_mi.portrait.face import find_faces
 
@@ -39,32 +40,46 @@ class Bowl:
     def __init__(self, empty_beyond: float = np.inf, undefined_beyond: float = np.inf):
         self.empty_beyond, self.undefined_beyond = empty_beyond, undefined_beyond
 
-    def start(self, stage, tensors):
-        return {}
+    def start(self, state):
+        return state
 
-    def refresh(self, tensors):
-        if np.abs(tensors["x"]).max() > self.empty_beyond:
+    def refresh(self, state):
+        if np.abs(state.avatar["x"]).max() > self.empty_beyond:
             raise EmptySurfaceError("nothing left")
 
-    def losses(self, tensors, stage, step, rng):
-        x = tensors["x"]
+    def losses(self, parameters, step, rng):
+        x = parameters["x"]
         weight = mi.Float(rng.uniform(0.8, 1.2, len(TARGET)).astype(np.float32))
         distance = dr.mean(weight * dr.square(x - mi.Float(TARGET)))
         return {"distance": dr.select(dr.max(dr.abs(dr.detach(x))) > self.undefined_beyond, dr.nan, distance)}
 
 
-def stages(factor: float, problem: Bowl | None = None, steps: int = 60) -> list:
-    first, second = Stage("first", steps, {"x": factor * RATE}), Stage("second", 8, {"x": 1e-3})
-    return [(lambda tensors: problem or Bowl(), stage) for stage in (first, second)]
+@dataclass(frozen=True)
+class Descent(Stage):
+    """A stage down a bowl."""
+
+    bowl: Problem = field(default_factory=Bowl)
+
+    def problem(self, task, state) -> Problem:
+        return self.bowl
 
 
-def descend(stages: list, progress: Progress | None = None, checkpoint=lambda progress: None) -> Progress:
-    progress = progress or Progress({"x": np.zeros(len(TARGET), np.float32)})
-    return run_stages(stages, progress, BLOCK, SEED, checkpoint)
+def stages(factor: float, problem: Problem | None = None, steps: int = 60) -> list[Stage]:
+    bowl = problem or Bowl()
+    return [Descent("first", steps, {"x": factor * RATE}, bowl=bowl), Descent("second", 8, {"x": 1e-3}, bowl=bowl)]
+
+
+def descend(stages: list[Stage], progress: Progress | None = None, checkpoint=lambda progress: None) -> Progress:
+    progress = progress or start_at(0.0)
+    return run_stages(stages, lambda stage, state: stage.problem(None, state), progress, BLOCK, SEED, checkpoint)
+
+
+def start_at(value: float) -> Progress:
+    return Progress(FitState({"x": np.full(len(TARGET), value, np.float32)}))
 
 
 def distance(progress: Progress) -> float:
-    return float(np.abs(progress.tensors["x"] - TARGET).max())
+    return float(np.abs(progress.state.avatar["x"] - TARGET).max())
 
 
 def test_a_healthy_descent_is_left_alone():
@@ -72,12 +87,12 @@ def test_a_healthy_descent_is_left_alone():
     progress = descend(stages(1.0))
     assert not progress.notes and distance(progress) < 0.2
     values = {"x": np.zeros(len(TARGET), np.float32)}
-    for number, (make, stage) in enumerate(stages(1.0)):
-        optimizer, problem = adam(values, stage.rates, beta_2=0.98), make(values)
+    for number, stage in enumerate(stages(1.0)):
+        optimizer, problem = adam(values, stage.rates, beta_2=0.98), Bowl()
         for step in range(stage.steps):
             driver._step(problem, optimizer, stage, step, 1.0, np.random.default_rng([SEED, number, step]))
         values = {"x": dr.detach(optimizer["x"]).numpy()}
-    assert np.array_equal(values["x"], progress.tensors["x"])
+    assert np.array_equal(values["x"], progress.state.avatar["x"])
 
 
 @pytest.mark.parametrize("factor", [300.0, 3e4])
@@ -94,21 +109,21 @@ class Rectifier:
     """The least network that can die: above the target its loss is steep, and below 0 it has no slope and a loss hardly
     above the first."""
 
-    def start(self, stage, tensors):
-        return {}
+    def start(self, state):
+        return state
 
-    def refresh(self, tensors):
+    def refresh(self, state):
         pass
 
-    def losses(self, tensors, stage, step, rng):
-        beyond = dr.maximum(tensors["x"], 0) - 1
+    def losses(self, parameters, step, rng):
+        beyond = dr.maximum(parameters["x"], 0) - 1
         return {"distance": 0.1 + dr.mean(dr.select(beyond > 0, 10.0, 1.0) * dr.square(beyond))}
 
 
 def test_a_network_that_dies_is_noticed():
     """One step far too long ends where nothing moves any more: no median of a block shows it, its steps do."""
-    progress = descend(stages(160.0, Rectifier()), Progress({"x": np.full(len(TARGET), 0.05, np.float32)}))
-    assert progress.notes and np.abs(progress.tensors["x"] - 1).max() < 0.1
+    progress = descend(stages(160.0, Rectifier()), start_at(0.05))
+    assert progress.notes and np.abs(progress.state.avatar["x"] - 1).max() < 0.1
 
 
 @pytest.mark.parametrize("fault", ["empty_beyond", "undefined_beyond"])
@@ -117,25 +132,25 @@ def test_lost_surface_and_undefined_loss_are_taken_back(fault):
     progress = descend(stages(100.0, Bowl(**{fault: 1.5})))
     words = {"empty_beyond": "nothing left", "undefined_beyond": "not finite"}[fault]
     assert any(words in note for note in progress.notes)
-    assert np.abs(progress.tensors["x"]).max() <= 1.5
+    assert np.abs(progress.state.avatar["x"]).max() <= 1.5
 
 
 def test_a_parameter_that_is_not_a_number_is_noticed_after_the_last_step():
     """Even where no later loss would show it."""
 
     class Poisoned(Bowl):
-        poisoned = False
+        steps = 0
 
-        def losses(self, tensors, stage, step, rng):
-            terms = super().losses(tensors, stage, step, rng)
-            if stage.name == "second" and step == stage.steps - 1 and not self.poisoned:
-                self.poisoned = True
-                terms["distance"] = dr.replace_grad(terms["distance"], dr.nan * dr.sum(tensors["x"]))
+        def losses(self, parameters, step, rng):
+            terms = super().losses(parameters, step, rng)
+            self.steps += 1
+            if self.steps == 60 + 8:
+                terms["distance"] = dr.replace_grad(terms["distance"], dr.nan * dr.sum(parameters["x"]))
             return terms
 
     progress = descend(stages(1.0, Poisoned()))
     assert [note for note in progress.notes if "stage second (a parameter is not finite)" in note]
-    assert np.isfinite(progress.tensors["x"]).all()
+    assert np.isfinite(progress.state.avatar["x"]).all()
 
 
 def test_hopeless_fits_end_with_one_line():
@@ -149,8 +164,8 @@ def test_losses_that_rise_whatever_the_steps_do_not_end_a_fit():
     """It is said, and the fit goes on at its shortest steps."""
 
     class Steeper(Bowl):
-        def losses(self, tensors, stage, step, rng):
-            return {"distance": 3.0 ** (step // BLOCK) * super().losses(tensors, stage, step, rng)["distance"]}
+        def losses(self, parameters, step, rng):
+            return {"distance": 3.0 ** (step // BLOCK) * super().losses(parameters, step, rng)["distance"]}
 
     progress = descend(stages(0.01, Steeper(), steps=15))
     assert len(progress.notes) == 2 * driver._MOST_ROLLBACKS and progress.stage == 2
@@ -174,7 +189,7 @@ def test_resume_after_a_rollback_ends_in_the_same_bits(killed_at, tmp_path, monk
     with pytest.raises(RuntimeError, match="killed"):
         descend(stages(300.0), checkpoint=lambda progress: save_progress(path, progress, "this"))
     twice = descend(stages(300.0), load_progress(path, "this") if path.exists() else None)
-    assert np.array_equal(once.tensors["x"], twice.tensors["x"])
+    assert np.array_equal(once.state.avatar["x"], twice.state.avatar["x"])
     assert once.notes == twice.notes
 
 
@@ -216,16 +231,16 @@ def test_portraits_that_cannot_be_fitted_are_refused_in_one_line(case, tmp_path,
 def test_a_fit_at_rates_a_thousand_times_too_high_keeps_its_head(tmp_path, capsys):
     """Of a real photo, in the stage that moves the most: it is said, and head and parameters stay finite."""
     settings = tiny_fit(steps=6)
-    kind, stage = settings.stages[1]
+    stage = settings.stages[1]
     fast = replace(stage, rates={name: 1000 * rate for name, rate in stage.rates.items()})
-    settings = replace(settings, stages=((kind, fast),))
+    settings = replace(settings, stages=(fast,))
     prior = load_avatar(PRIOR)
     portrait = read_portrait(FitRequest(None, tmp_path, example=True), settings, prior)
-    progress = Progress(initial_tensors(prior, 0))
-    fit_portrait(portrait, PRIOR, settings, 0, tmp_path, progress)
+    progress = Progress(initial_state(prior, 0))
+    fit_portrait(FitTask(portrait, prior, PRIOR, settings, tmp_path, settings.plan()), progress, 0)
     assert progress.notes and "note: the fit diverged" in capsys.readouterr().err
-    assert all(np.isfinite(value).all() for value in progress.tensors.values())
-    shape = {name: progress.tensors[name] for name in ("z_sdf", "deformation")}
+    assert all(np.isfinite(value).all() for value in progress.state.arrays().values())
+    shape = progress.state.parameters(("z_sdf", "deformation"))
     save_avatar(tmp_path / "a.safetensors", prior.replaced(**shape))
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(tmp_path / "a.safetensors"), "voxel": 0.16})
     assert np.isfinite(head.vertices()).all()

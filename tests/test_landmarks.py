@@ -198,9 +198,9 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
     """AD through placing, landmark model, pose and camera against central differences."""
     from conftest import camera, slopes
 
-    from sira_mi.fit.fit import initial_tensors
-    from sira_mi.fit.geometry import GeometryProblem
+    from sira_mi.fit.geometry import GeometryProblem, GeometryScene
     from sira_mi.fit.settings import QUALITIES
+    from sira_mi.fit.state import initial_state
     from sira_mi.portrait.portrait import Portrait
 
     learned = fit_landmark_model.add_landmark_model(prior, found)
@@ -210,21 +210,23 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
     pixels = view.project(np.nan_to_num(prior.tensors["landmarks"])) + np.array([3.0, -2.0])
     pixels[50] = np.nan
     grey, whole = np.full((64, 64, 3), 0.2, np.float32), np.ones((64, 64), np.float32)
-    settings = replace(QUALITIES["draft"], learned_radiance=False)
-    problem = GeometryProblem(Portrait(grey, whole, pixels, pixels, view, ()), learned, str(path), settings)
-    tensors = initial_tensors(learned, 0) | {"pose": np.array([0.1, -0.2, 0.05, 0.1, -0.1, 0.2], np.float32)}
-    problem.refresh(tensors)
+    settings = QUALITIES["draft"]
+    scene = GeometryScene(Portrait(grey, whole, pixels, pixels, view, ()), learned, path, settings, exposure=1.0)
+    problem = GeometryProblem(settings.stages[0], scene)
+    state = replace(initial_state(learned, 0), pose=np.array([0.1, -0.2, 0.05, 0.1, -0.1, 0.2], np.float32))
+    problem.refresh(state)
+    start = state.parameters(("pose", "z_sdf", "deformation", "reference"))
     for name in ("pose", "z_sdf"):
 
         def loss(value, name=name):
-            values = {k: mi.Float(tensors[k]) for k in ("pose", "z_sdf", "deformation", "reference")}
+            values = {k: mi.Float(v) for k, v in start.items()}
             values[name] = mi.Float(value)
             dr.enable_grad(values[name])
-            return problem._landmark_loss(problem._field(values)), values[name]
+            return problem._landmark_loss(problem._field(values), scene.landmarks), values[name]
 
-        result, value = loss(tensors[name])
+        result, value = loss(start[name])
         dr.backward(result)
         gradient = dr.grad(value).numpy()
         assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
-        slope, difference = slopes(lambda v: loss(v)[0].numpy().item(), tensors[name], gradient, 0.02)
+        slope, difference = slopes(lambda v: loss(v)[0].numpy().item(), start[name], gradient, 0.02)
         assert slope == pytest.approx(difference, rel=0.05)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from conftest import camera
 
-from sira_mi.fit.fit import initial_tensors
-from sira_mi.fit.geometry import GeometryProblem
+from sira_mi.fit.geometry import GeometryProblem, GeometryScene
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.shaded import seen_points
+from sira_mi.fit.state import FitState
 from sira_mi.portrait.portrait import Portrait
 
 
@@ -30,17 +30,17 @@ def test_the_derivative_of_the_mask_loss_is_that_of_its_values(variant, avatar, 
     mask[seen.row, seen.column] = 1
     assert 0.1 < mask.mean() < 0.6 and not mask[0].any()
     photo = Portrait(np.full((size, size, 3), 0.2, np.float32), mask, np.full((468, 2), np.nan), None, view, ())
-    settings = replace(QUALITIES["draft"], rays=size * size, points=64, voxel=0.1, learned_radiance=False)
-    problem = GeometryProblem(replace(photo, head_landmarks=photo.landmarks), avatar, avatar_path, settings)
-    stage = replace(settings.stages[0][1], mask_sharpness=sharpness)
-    tensors = initial_tensors(avatar, 0) | {name: avatar.tensors[name] for name in ("z_sdf", "z_r")}
+    settings = replace(QUALITIES["draft"], rays=size * size, points=64, voxel=0.1)
+    photo = replace(photo, head_landmarks=photo.landmarks)
+    stage = replace(settings.stages[0], mask_sharpness=sharpness)
+    problem = GeometryProblem(stage, GeometryScene(photo, avatar, avatar_path, settings, exposure=1.0))
 
     def loss(z: float) -> tuple[float, float]:
-        moved = tensors | {"pose": np.array([0, 0, 0, 0, 0, z], np.float32)}
-        problem.refresh(moved)
-        variables = {name: mi.Float(moved[name]) for name in stage.rates}
+        state = replace(FitState.of_avatar(avatar), pose=np.array([0, 0, 0, 0, 0, z], np.float32))
+        problem.refresh(state)
+        variables = {name: mi.Float(value) for name, value in state.parameters(stage.rates).items()}
         dr.enable_grad(variables["pose"])
-        result = problem.losses(variables, stage, 0, np.random.default_rng(0))["mask"]
+        result = problem.losses(variables, 0, np.random.default_rng(0))["mask"]
         dr.backward(result)
         return result.numpy().item(), dr.grad(variables["pose"]).numpy()[5]
 

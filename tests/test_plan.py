@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +16,12 @@ from sira_mi.decisions import Decision, Plan, explain
 from sira_mi.errors import InputError
 from sira_mi.export.scene import orbit
 from sira_mi.fields.directions import fibonacci_directions
-from sira_mi.fit.driver import Progress, run_stages
-from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
-from sira_mi.fit.leave_out import plan_fit
-from sira_mi.fit.measure import measured_fit
-from sira_mi.fit.settings import APPEARANCE
+from sira_mi.fit.appearance import AppearanceStage
+from sira_mi.fit.driver import Progress
+from sira_mi.fit.fit import FitRequest, fit_portrait, read_portrait
+from sira_mi.fit.measure import measure_fit
+from sira_mi.fit.stage import FitTask
+from sira_mi.fit.state import initial_state
 from sira_mi.relight import measure
 from sira_mi.relight.__main__ import main as relight
 from sira_mi.relight.leave_out import TOLERANCE, approximate_lobes, largest_reflectance, plan_relight
@@ -150,14 +150,14 @@ def test_a_plan_is_carried_out_and_switched_off():
             saved_spread=0.02,
         ),
         Decision("b", "picture", False, "why not", changes={"visibility": False}),
-        Decision("c", "picture", True, "always", built_in=True),
+        Decision("c", "picture", True, "it is 0"),
     )
     plan = Plan(decisions)
     settings = plan.apply(RelightSettings())
     assert settings.max_depth == 4 and settings.visibility and plan.bound == 1e-3
     kept = plan.keep_all()
     assert kept.apply(RelightSettings()) == RelightSettings() and kept.bound == 0
-    assert kept.leaves_out("c", "picture") and not kept.leaves_out("a", "picture")
+    assert not any(kept.leaves_out(name, "picture") for name in "abc")
     text = explain(plan)
     assert "bound 1.0e-03, measured 1.0e-04 ± 1.0e-05, 25 ± 2 % of the time saved" in text and text.count("\n") == 2
     assert json.loads(json.dumps(plan.report()))[0]["changes"] == {"max_depth": 4}
@@ -317,51 +317,46 @@ def test_the_points_of_a_surface_repeat_and_lie_on_it(blob):
 
 
 @pytest.fixture(scope="module")
-def problem():
-    """The appearance stages of a tiny fit of the example, its settings and its tensors."""
+def task(tmp_path_factory):
+    """The appearance stages of a tiny fit of the example."""
     settings, prior = tiny_fit(steps=4), load_avatar(PRIOR)
-    settings = replace(settings, stages=tuple(s for s in settings.stages if s[0] == APPEARANCE))
-    with tempfile.TemporaryDirectory() as folder:
-        portrait = read_portrait(FitRequest(None, Path(folder), example=True), settings, prior)
-        tensors = initial_tensors(prior, 0)
-        return stage_problems(portrait, prior, PRIOR, Path(folder), settings)[APPEARANCE](tensors), settings, tensors
+    settings = replace(settings, stages=tuple(s for s in settings.stages if isinstance(s, AppearanceStage)))
+    folder = tmp_path_factory.mktemp("fit")
+    portrait = read_portrait(FitRequest(None, folder, example=True), settings, prior)
+    return FitTask(portrait, prior, PRIOR, settings, folder, settings.plan())
 
 
 @pytest.mark.slow
-def test_a_fit_with_and_without_the_plan_is_the_same(problem):
+def test_a_fit_with_and_without_the_plan_is_the_same(task):
     """What the stages leave out is 0 or was computed before: gradients and results differ by rounding at most."""
-    made, settings, tensors = problem
-    plan = plan_fit(settings)
-    taken = {(d.name, d.where) for d in plan.decisions if d.left_out and not d.built_in}
+    taken = {(d.name, d.where) for d in task.plan.decisions if d.left_out}
     base = "base albedo at every step"
-    assert taken == {("speculars", "light"), ("speculars", "albedo"), (base, "light"), (base, "refinement")}
-    for decision in measured_fit(plan, made, settings, tensors).decisions:
-        assert decision.error is None or decision.error <= 1e-5, decision
-        assert (decision.error is None) == (decision.built_in or not decision.left_out)
+    assert taken == {("specular term", "light"), ("specular term", "albedo"), (base, "light"), (base, "refinement")}
+    start = initial_state(task.prior, 0)
+    for decision in measure_fit(task, start).decisions:
+        assert decision.error is not None and decision.error <= 1e-5, decision
     results = []
-    for one in (plan, plan.keep_all()):
-        made.plan = one
-        progress = Progress(dict(tensors))
-        run_stages([(lambda _: made, stage) for _, stage in settings.stages], progress, settings.block, 0, lambda _: 0)
-        results.append(progress.tensors)
-    for name, value in results[0].items():
-        np.testing.assert_allclose(value, results[1][name], rtol=0, atol=1e-5, err_msg=name)
-    assert not np.array_equal(results[0]["z_a"], tensors["z_a"])
+    for plan in (task.plan, task.plan.keep_all()):
+        progress = Progress(start)
+        fit_portrait(task.with_plan(plan), progress, seed=0)
+        results.append(progress.state)
+    for name, value in results[0].arrays().items():
+        np.testing.assert_allclose(value, results[1].arrays()[name], rtol=0, atol=1e-5, err_msg=name)
+    assert not np.array_equal(results[0].avatar["z_a"], start.avatar["z_a"])
 
 
-def test_a_changed_base_albedo_is_computed_again(problem):
-    """The base albedo of a stage that holds it is that of the tensors at hand, also after another stage moved them."""
-    made, settings, tensors = problem
-    made.plan = plan_fit(settings)
-    stage, index = settings.stages[-1][1], np.arange(10)
+def test_a_changed_base_albedo_is_computed_again(task):
+    """The base albedo of a stage that holds it is that of the state at hand, also after another stage moved it."""
+    stage, index = task.settings.stages[-1], np.arange(10)
+    state = initial_state(task.prior, 0)
+    once, always = (stage.problem(task.with_plan(plan), state) for plan in (task.plan, task.plan.keep_all()))
     values = []
-    for z_a in (tensors["z_a"], tensors["z_a"] + 0.5):
-        made.refresh({**tensors, "z_a": z_a})
-        values.append(made._base_and_skin(made._fixed, stage, index)[0].numpy())
-        made.plan = made.plan.keep_all()
-        np.testing.assert_allclose(values[-1], made._base_and_skin(made._fixed, stage, index)[0].numpy(), atol=1e-6)
-        made.plan = plan_fit(settings)
-    assert np.abs(values[0] - values[1]).max() > 1e-3
+    for z_a in (state.avatar["z_a"], state.avatar["z_a"] + 0.5):
+        for problem in (once, always):
+            problem.refresh(state.with_parameters({"z_a": z_a}))
+            values.append(problem._base_and_skin(problem._fixed, index)[0].numpy())
+        np.testing.assert_allclose(values[-2], values[-1], atol=1e-6)
+    assert np.abs(values[0] - values[2]).max() > 1e-3
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@ leaves a whole avatar however it ends."""
 
 import dataclasses
 import json
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -12,42 +13,46 @@ from conftest import camera, slopes, tiny_fit
 
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, run_stages
-from sira_mi.fit.settings import PolishSettings, polish_stage
+from sira_mi.fit.settings import polish_stage
+from sira_mi.fit.stage import FitTask
+from sira_mi.fit.state import FitState
 from sira_mi.optimisation.adam import read_arrays
 from sira_mi.portrait.portrait import Portrait
 
-BLOB = dataclasses.replace(tiny_fit(steps=2), polish=PolishSettings(size=32, samples=64))
+STAGE = dataclasses.replace(polish_stage(30), size=32, samples=64)
 MOVED = ("z_l", "illumination", "z_s", "albedo_refinement")
 
 
 @pytest.fixture(scope="module")
-def problem(variant, avatar, avatar_path):
+def problem(variant, avatar, avatar_path, tmp_path_factory):
     """The polish of a blob, whose photo is the path-traced picture of the avatar's own tensors."""
-    from sira_mi.fit.polish import PolishProblem
-
     whole = np.ones((32, 32), np.float32)
     nowhere = np.full((468, 2), np.nan)
     photo = Portrait(np.zeros((32, 32, 3), np.float32), whole, nowhere, nowhere, camera(focal=40, size=32), ())
-    problem = PolishProblem(photo, avatar, avatar_path, BLOB)
-    problem.target = picture(problem, avatar.tensors)
+    folder = tmp_path_factory.mktemp("polish")
+    state, settings = FitState.of_avatar(avatar), tiny_fit(steps=2)
+    task = FitTask(photo, avatar, Path(avatar_path), settings, folder, settings.plan())
+    problem = STAGE.problem(task, state)
+    problem.target = picture(problem, state)
     return problem
 
 
-def picture(problem, tensors) -> np.ndarray:
+def picture(problem, state: FitState) -> np.ndarray:
     """The path-traced picture [h, w, 3] of an avatar's networks and latents."""
-    floats = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
+    floats = {name: mi.Float(value) for name, value in state.avatar.items()}
     with dr.suspend_grad():
-        problem._show(problem._appearance(floats, 1.0, np.random.default_rng(0)))
+        problem._show(problem._appearance(floats, np.random.default_rng(0)))
         return mi.render(problem.scene, spp=256, seed=3).numpy()[..., :3]
 
 
-def other(avatar) -> dict[str, np.ndarray]:
-    """The avatar's tensors with another refinement and light."""
+def other(avatar) -> FitState:
+    """The avatar with another refinement and light."""
     rng = np.random.default_rng(5)
-    tensors = {name: value for name, value in avatar.tensors.items() if name not in ("landmarks", "lobes")}
+    changed = {}
     for name, size in (("albedo_refinement", 0.2), ("z_l", 0.5)):
-        tensors[name] = tensors[name] + (size * rng.standard_normal(tensors[name].shape)).astype(np.float32)
-    return tensors
+        value = avatar.tensors[name]
+        changed[name] = value + (size * rng.standard_normal(value.shape)).astype(np.float32)
+    return FitState.of_avatar(avatar).with_parameters(changed)
 
 
 @pytest.mark.slow
@@ -55,21 +60,22 @@ def other(avatar) -> dict[str, np.ndarray]:
 def test_derivative_is_that_of_the_path_traced_picture(problem, avatar, name):
     """Through vertices, `prb` and networks: the mean of a few steps' derivatives against a central difference of the
     same paths."""
-    tensors = other(avatar)
-    problem.refresh(tensors)
-    fixed = {key: mi.Float(value) for key, value in tensors.items()}
+    state = other(avatar)
+    problem.refresh(state)
+    fixed = {key: mi.Float(value) for key, value in state.avatar.items()}
+    start = state.avatar[name]
 
     def color(value):
-        return problem._color({**fixed, name: value}, 1.0, np.random.default_rng(1))
+        return problem._color({**fixed, name: value}, np.random.default_rng(1))
 
     def loss(value):
         return float(color(mi.Float(value)).numpy().item())
 
-    value = mi.Float(tensors[name])
+    value = mi.Float(start)
     dr.enable_grad(value)
     dr.backward(color(value))
     gradient = dr.grad(value).numpy()
-    ad, difference = slopes(loss, tensors[name], gradient, 0.05)
+    ad, difference = slopes(loss, start, gradient, 0.05)
     assert ad == pytest.approx(difference, rel=0.1)
 
 
@@ -78,12 +84,11 @@ def test_polish_finds_albedo_and_light_again(problem, avatar):
     """From another albedo and light, a few steps bring the path-traced picture most of the way to the photo, through
     the driver that runs all stages."""
     start = other(avatar)
-    _, stage = polish_stage(30)
-    stage = dataclasses.replace(stage, rates={name: 2 * rate for name, rate in stage.rates.items()})
-    progress = run_stages([(lambda tensors: problem, stage)], Progress(dict(start)), 10, 0, lambda progress: None)
-    before, after = (np.abs(picture(problem, t) - problem.target).mean() for t in (start, progress.tensors))
+    stage = dataclasses.replace(STAGE, rates={name: 2 * rate for name, rate in STAGE.rates.items()})
+    progress = run_stages([stage], lambda stage, state: problem, Progress(start), 10, 0, lambda progress: None)
+    before, after = (np.abs(picture(problem, state) - problem.target).mean() for state in (start, progress.state))
     assert after < 0.6 * before
-    assert all(not np.array_equal(start[name], progress.tensors[name]) for name in MOVED)
+    assert all(not np.array_equal(start.avatar[name], progress.state.avatar[name]) for name in MOVED)
 
 
 @pytest.fixture(scope="module")
@@ -106,17 +111,17 @@ def fit(tmp_path_factory):
         written.append((avatar, json.loads(json.dumps(report))))
 
     with pytest.MonkeyPatch.context() as patch:
-        settings = dataclasses.replace(tiny_fit(steps=2), polish=PolishSettings(size=48, samples=4))
-        patch.setitem(fit_settings.QUALITIES, "draft", settings)
-        patch.setattr("sira_mi.fit.fit.polish_stage", lambda: polish_stage(9))
+        stage = dataclasses.replace(polish_stage(9), size=48, samples=4)
+        patch.setitem(fit_settings.QUALITIES, "draft", tiny_fit(steps=2))
+        patch.setattr("sira_mi.fit.fit.polish_stage", lambda: stage)
         patch.setattr("sira_mi.fit.fit.write_folder", write)
         patch.setattr(driver, "_CHECKPOINT_SECONDS", 0.0)
         patch.setattr(driver, "_step", interrupted)
         assert fit_photo(request) == 130
-        checkpoint, _ = read_arrays(out / ".fit" / "checkpoint.safetensors")
+        checkpoint = FitState.from_arrays(read_arrays(out / ".fit" / "checkpoint.safetensors")[0])
         patch.setattr(driver, "_step", step_of_driver)
         assert fit_photo(request) == 0
-    return *written, {k.removeprefix("tensor/"): v for k, v in checkpoint.items() if k.startswith("tensor/")}
+    return *written, checkpoint
 
 
 @pytest.mark.slow
@@ -125,8 +130,8 @@ def test_interrupt_in_the_polish_leaves_the_avatar_as_it_was_before(fit):
     (avatar, report), _, checkpoint = fit
     assert report["complete"] is False and "polish" not in report
     for name in MOVED:
-        assert np.array_equal(avatar.tensors[name], checkpoint[f"before_polish/{name}"])
-        assert not np.array_equal(avatar.tensors[name], checkpoint[name])
+        assert np.array_equal(avatar.tensors[name], checkpoint.before_polish().avatar[name])
+        assert not np.array_equal(avatar.tensors[name], checkpoint.avatar[name])
 
 
 @pytest.mark.slow

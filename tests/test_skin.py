@@ -9,9 +9,11 @@ from conftest import camera
 
 from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fit.fit import initial_tensors
 from sira_mi.fit.settings import QUALITIES
+from sira_mi.fit.stage import FitTask
+from sira_mi.fit.state import FitState, initial_state
 from sira_mi.portrait.portrait import Portrait
+from studies.portraits.methods import UntrainedRadianceTask
 
 SIZE = 128
 EYES = (33, 246, 161, 160, 159, 158, 157, 173, 133, 155, 154, 153, 145, 144, 163, 7)  # around the right one
@@ -99,13 +101,13 @@ def test_an_eye_that_misleads_hardly_counts(variant):
 @pytest.mark.slow
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     """The loss is lowest where the albedo at the landmarks has the expected luminance."""
-    from sira_mi.fit.shaded import base_albedo, photo_points
+    from sira_mi.fit.shaded import base_albedo, masked_points
     from sira_mi.fit.skin import skin_cues, skin_luminance, skin_patches
 
     prior = load_avatar(PRIOR)
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(PRIOR), "voxel": 0.1})
-    points = photo_points(portrait, head, shadows=False)
-    floats = {name: mi.Float(value) for name, value in prior.tensors.items() if value.ndim == 1}
+    points = masked_points(portrait, head)
+    floats = {name: mi.Float(value) for name, value in FitState.of_avatar(prior).avatar.items()}
     patches = skin_patches(portrait, points)
     assert len(patches.points.row) > 6
     assert patches.luminance == skin_luminance(skin_cues(portrait))
@@ -120,28 +122,23 @@ def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
 
 
 @pytest.mark.slow
-def test_geometry_does_not_depend_on_the_exposure(variant, portrait):
+def test_geometry_does_not_depend_on_the_exposure(variant, portrait, tmp_path):
     """A photo a quarter as bright has the same losses: the learned radiance starts a quarter as bright, and both are
-    compared at the exposure of the training. An untrained rendering function is left alone."""
-    from sira_mi.fit.geometry import GeometryProblem
-
-    prior = load_avatar(PRIOR)
+    compared at the exposure of the training. An untrained rendering network is left alone."""
+    prior, state = load_avatar(PRIOR), initial_state(load_avatar(PRIOR), 0)
     settings = dataclasses.replace(QUALITIES["draft"], rays=256, points=64, voxel=0.16)
-    stage = settings.stages[0][1]
+    stage = settings.stages[0]
 
     def losses(photo: Portrait) -> dict[str, float]:
-        problem = GeometryProblem(photo, prior, str(PRIOR), settings)
-        tensors = initial_tensors(prior, 0)
-        tensors |= problem.start(stage, tensors)
-        problem.refresh(tensors)
-        moved = {name: mi.Float(tensors[name]) for name in stage.rates}
-        terms = problem.losses(moved, stage, 0, np.random.default_rng(0))
-        return {name: value.numpy().item() for name, value in terms.items()}
+        problem = stage.problem(FitTask(photo, prior, PRIOR, settings, tmp_path, settings.plan()), state)
+        started = problem.start(state)
+        problem.refresh(started)
+        moved = {name: mi.Float(value) for name, value in started.parameters(stage.rates).items()}
+        return {k: v.numpy().item() for k, v in problem.losses(moved, 0, np.random.default_rng(0)).items()}
 
     usual, dark = losses(portrait), losses(darker(portrait, 4))
     assert usual["color"] > 1e-3
     assert dark == pytest.approx(usual, rel=1e-3)
-    settings = dataclasses.replace(settings, learned_radiance=False)
-    problem = GeometryProblem(darker(portrait, 4), prior, str(PRIOR), settings)
-    tensors = initial_tensors(prior, 0)
-    assert np.array_equal(problem.start(stage, tensors)["rendering"], tensors["rendering"])
+    untrained = UntrainedRadianceTask(darker(portrait, 4), prior, PRIOR, settings, tmp_path, settings.plan())
+    started = stage.problem(untrained, state).start(state)
+    assert np.array_equal(started.avatar["rendering"], state.avatar["rendering"])

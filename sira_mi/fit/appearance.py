@@ -1,94 +1,151 @@
-"""The appearance stages of section 3.2.2, on the surface points behind the photo's pixels: light, albedo, speculars,
-refinement, with the losses of eqs 12 and 13. Geometry is fixed, so points are found once."""
+"""The appearance stages of section 3.2.2 up to the refinement: light, albedo and specular term, on the surface points
+behind the photo's pixels. Geometry is fixed, so that points and their visibility are found once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, light_refinement, refine_albedo
+from sira_mi.avatar.decoders import diffuse_albedo
 from sira_mi.avatar.file import Avatar
-from sira_mi.decisions import Plan
+from sira_mi.decisions import Decision
 from sira_mi.fields.columns import evaluate_in_chunks, in_three
-from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.leave_out import BASE_ALBEDO, SPECULARS, plan_fit
-from sira_mi.fit.residual import albedo_shares, albedo_variances, light_variances, log_residual, share_loss
-from sira_mi.fit.settings import FitSettings, Stage
-from sira_mi.fit.shaded import PhotoPoints, base_albedo, decoder, photo_points, shade_points
+from sira_mi.fit.residual import albedo_variances
+from sira_mi.fit.shaded import PhotoPoints, Shading, base_albedo, decoder, shade_points
 from sira_mi.fit.skin import skin_patches
+from sira_mi.fit.stage import Arrays, FitTask, Problem, Stage
+from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
-from sira_mi.portrait.portrait import Portrait
 
-# ε of the smoothness of the refinement, scene units.
-_JITTER = 0.01
+# Names of the decisions that these stages take.
+SPECULAR, BASE_ALBEDO = "specular term", "base albedo at every step"
+
+
+@dataclass(frozen=True)
+class AppearanceWeights:
+    """Weights of the losses of section 3.2.2 that all appearance stages have."""
+
+    embedding: float = 1e-5  # on ‖z‖²
+    white_light: float = 0.005  # mean squared log-chroma of the lobes: the prior on the light's colour
+    skin_tone: float = 2e-2  # on the deviation of the skin's albedo from the expected tone, in standard deviations
+
+
+@dataclass(frozen=True)
+class AppearanceStage(Stage):
+    """Light and albedos by eq. 8, without refinement."""
+
+    weights: AppearanceWeights = field(default_factory=AppearanceWeights)
+
+    def problem(self, task: FitTask, state: FitState) -> Problem:
+        return AppearanceProblem(self, task, share_surface(task, state))
+
+    def _without_specular(self) -> Decision:
+        return Decision(SPECULAR, self.name, True, "k_s is 0 at every step")
+
+    def _fixed_base(self) -> Decision:
+        return Decision(BASE_ALBEDO, self.name, True, "its latent and network are fixed: once, with the skin's tone")
+
+
+@dataclass(frozen=True)
+class LightStage(AppearanceStage):
+    """The light under which the prior's albedo looks like the photo."""
+
+    def problem(self, task: FitTask, state: FitState) -> Problem:
+        return LightProblem(self, task, share_surface(task, state))
+
+    def decisions(self) -> tuple[Decision, ...]:
+        return self._without_specular(), self._fixed_base()
+
+
+@dataclass(frozen=True)
+class AlbedoStage(AppearanceStage):
+    """Light and diffuse albedo."""
+
+    def decisions(self) -> tuple[Decision, ...]:
+        return (self._without_specular(),)
+
+
+@dataclass(frozen=True)
+class SpecularStage(AppearanceStage):
+    """Light and both albedos, while the specular term fades in."""
+
+    k_s: tuple[float, float] = (0.0, 1.0)
+
+
+class PhotoSurface:
+    """The fitted surface behind the pixels of a photo, and what the photo says of it."""
+
+    def __init__(self, task: FitTask, state: FitState):
+        self.portrait = task.pose_portrait(state)
+        path = str(task.write_avatar(state))
+        head = mi.load_dict({"type": "neural_sdf", "avatar": path, "voxel": task.settings.voxel})
+        self.points = task.photo_points(self.portrait, head)
+        self.skin = skin_patches(self.portrait, self.points)
+        row, column = self.points.row, self.points.column
+        self.albedo_variances = albedo_variances(self.portrait, row, column)
+        self.radiance = np.ascontiguousarray(self.portrait.image[row, column].T, dtype=np.float32)  # [3, N]
+
+
+def share_surface(task: FitTask, state: FitState) -> PhotoSurface:
+    """The surface of the appearance stages that follow each other."""
+    return task.share(PhotoSurface, lambda: PhotoSurface(task, state))
 
 
 class AppearanceProblem:
-    """The losses of the appearance stages for one portrait on the fitted geometry of the avatar at `avatar_path`.
-    `plan` says what each stage leaves out (default: all that `plan_fit` finds)."""
+    """The losses of an appearance stage without refinement."""
 
-    def __init__(
-        self, portrait: Portrait, avatar: Avatar, avatar_path: str, settings: FitSettings, plan: Plan | None = None
-    ):
-        self.avatar, self.settings = avatar, settings
-        self.plan = plan_fit(settings) if plan is None else plan
-        self._base_at, self._base = None, None
-        head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": settings.voxel})
-        self.points = photo_points(portrait, head, settings.shadows)
-        self.skin = skin_patches(portrait, self.points)
-        self.albedo_variances = albedo_variances(portrait, self.points.row, self.points.column)
-        self.target = np.ascontiguousarray(portrait.image[self.points.row, self.points.column].T, dtype=np.float32)
+    def __init__(self, stage: AppearanceStage, task: FitTask, surface: PhotoSurface):
+        self.stage, self.surface, self.plan = stage, surface, task.plan
+        self.avatar, self.pixels = task.prior, task.settings.pixels
+        # The parameters that the fixed base albedo was evaluated at; the albedo [3, N] and the loss of the skin's tone.
+        self._base_at: tuple[np.ndarray, ...] = ()
+        self._base: tuple[np.ndarray, Any] | None = None
 
-    def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Before the light is first optimised, its decoder is scaled to the photo's exposure: the ratio of the photo's
-        to the rendered mean radiance at the prior's albedo, as one factor for all channels. Before it is refined, it
-        is settled which shares of the residual are the albedo's; the refinement of the light starts from 1."""
-        self.refresh(tensors)
-        index = self._draw(np.random.default_rng(0))
-        if stage.k_s[1] == 0 and "z_a" not in stage.rates:
-            diffuse, _ = self._base_radiance(self.points[index], stage.k_s[0])
-            factor = self.target[:, index].mean() / max(float(diffuse.mean()), 1e-6)
-            return {"illumination": exposed(self.avatar, tensors["illumination"], factor)}
-        if not _refines_light(stage):
-            return {}
+    def start(self, state: FitState) -> FitState:
+        return state
 
-        def radiance(points: PhotoPoints) -> np.ndarray:
-            return sum(self._base_radiance(points, stage.k_s[0]))
+    def refresh(self, state: FitState) -> None:
+        """Makes arrays of all of the avatar's parameters, those that the stage holds fixed included."""
+        self._fixed = {name: mi.Float(value) for name, value in state.avatar.items()}
+        base_at = state.avatar["diffuse_albedo"], state.avatar["z_a"]
+        if not self._base_at or not all(map(np.array_equal, self._base_at, base_at)):
+            self._base_at, self._base = base_at, None
 
-        diffuse, specular = self._base_radiance(self.points[index], stage.k_s[0])
-        residual = log_residual(self.target[:, index] - specular, diffuse)
-        light = light_variances(radiance, self.points, index, seed=0)
-        network = self.avatar.architecture.networks["light_refinement"]
-        return {
-            "light_refinement": initial_parameters(network, np.random.default_rng(0), output_scale=0.0),
-            "albedo_shares": albedo_shares(residual, index, self.albedo_variances, light),
-        }
-
-    def _base_radiance(self, points: PhotoPoints, k_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Diffuse and specular radiance [3, n] of the base albedo at `points`."""
-        with dr.suspend_grad():
-            shading = shade_points(self.avatar, self._fixed, k_s, points, base_albedo(self.avatar, self._fixed, points))
-            return shading.diffuse.numpy(), shading.specular.numpy()
+    def losses(self, parameters: Arrays, step: int, rng: np.random.Generator) -> Arrays:
+        current = {**self._fixed, **parameters}
+        index = self._draw(rng)
+        points = self.surface.points[index]
+        base, skin_tone = self._base_and_skin(current, index)
+        shading = shade_points(self.avatar, current, self._k_s(step), points, base)
+        target = mi.TensorXf(np.ascontiguousarray(self.surface.radiance[:, index]))
+        color = losses.photometric_loss(shading.diffuse + shading.specular, target)
+        return {"color": color, **self._prior_losses(current, shading, skin_tone)}
 
     def _draw(self, rng: np.random.Generator) -> np.ndarray:
-        count = self.target.shape[1]
-        return np.sort(rng.choice(count, min(self.settings.pixels, count), replace=False))
+        """Indices of the points that a step looks at, ascending."""
+        count = self.surface.radiance.shape[1]
+        return np.sort(rng.choice(count, min(self.pixels, count), replace=False))
 
-    def refresh(self, tensors: dict[str, np.ndarray]) -> None:
-        """Makes arrays of all tensors, those that the stage holds fixed included."""
-        self.shares = tensors.get("albedo_shares")
-        self._fixed = {name: mi.Float(value) for name, value in tensors.items() if value.ndim == 1}
-        decoder_of_base = tensors["diffuse_albedo"], tensors["z_a"]
-        if self._base_at is None or not all(map(np.array_equal, self._base_at, decoder_of_base)):
-            self._base_at, self._base = decoder_of_base, None
+    def _k_s(self, step: int) -> float | None:
+        """The weight of the specular term at a step; it reaches its last value in the middle of the stage. None to
+        leave the term out."""
+        if self.plan.leaves_out(SPECULAR, self.stage.name):
+            return None
+        (first, last), share = self.stage.k_s, step / max(self.stage.steps - 1, 1)
+        return first + (last - first) * min(1.0, 2 * share)
 
-    def _base_and_skin(self, current: dict, stage: Stage, index: np.ndarray) -> tuple:
-        """Base albedo [3, n] at the points `index` and the loss of the skin's tone (None without skin); of a stage that
-        holds both fixed, both are evaluated once."""
-        if not self.plan.leaves_out(BASE_ALBEDO, stage.name):
+    def _base_and_skin(self, current: Arrays, index: np.ndarray) -> tuple[Any, Any]:
+        """Base albedo, tensor [3, n], at the points `index`, and the loss of the skin's tone (None without skin). A
+        stage that holds both fixed evaluates both once."""
+        if not self.plan.leaves_out(BASE_ALBEDO, self.stage.name):
             skin = self._skin_loss(current)
-            return base_albedo(self.avatar, current, self.points[index]), skin
+            return base_albedo(self.avatar, current, self.surface.points[index]), skin
         if self._base is None:
-            a, points = self.avatar.architecture, self.points
+            a, points = self.avatar.architecture, self.surface.points
             network = decoder(self.avatar, "diffuse_albedo", self._fixed, "z_a")
             (base,) = evaluate_in_chunks(
                 lambda x_ref, gamma: diffuse_albedo(network, a.albedo_octaves, x_ref, gamma), points.x_ref, points.gamma
@@ -97,80 +154,51 @@ class AppearanceProblem:
         base, skin = self._base
         return mi.TensorXf(np.ascontiguousarray(base[:, index])), skin
 
-    def _skin_loss(self, current: dict):
-        return None if self.skin is None else self.skin.loss(self.avatar, current)
+    def _skin_loss(self, current: Arrays) -> Any:
+        return None if self.surface.skin is None else self.surface.skin.loss(self.avatar, current)
 
-    def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
-        weights, a = self.settings.appearance, self.avatar.architecture
-        current = {**self._fixed, **tensors}
-        index = self._draw(rng)
-        points = self.points[index]
-
-        share = step / max(stage.steps - 1, 1)
-        k_s = stage.k_s[0] + (stage.k_s[1] - stage.k_s[0]) * min(1.0, 2 * share)
-        if self.plan.leaves_out(SPECULARS, stage.name):
-            k_s = None
-        base, skin_tone = self._base_and_skin(current, stage, index)
-        albedo = base
-        if stage.k_r > 0:
-            network = decoder(self.avatar, "albedo_refinement", current)
-            x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
-            fine = albedo_refinement(network, a.refinement_octaves, x_ref, gamma)
-            albedo = refine_albedo(base, fine, stage.k_r)
-        shading = shade_points(self.avatar, current, k_s, points, albedo)
-        target = mi.TensorXf(np.ascontiguousarray(self.target[:, index]))
-        radiance = shading.diffuse + shading.specular
-        if _refines_light(stage):
-            of_light = light_refinement(
-                decoder(self.avatar, "light_refinement", current), a.refinement_octaves, x_ref, gamma
-            )
-            radiance = radiance * dr.exp(of_light)
+    def _prior_losses(self, current: Arrays, shading: Shading, skin_tone: Any) -> Arrays:
+        """What is known of latent codes, light and skin without the photo."""
+        weights, latents = self.stage.weights, ("z_a", "z_s", "z_l")
         terms = {
-            "color": losses.photometric_loss(radiance, target),
-            "embedding": weights.embedding * losses.squared_norm(*(current[name] for name in ("z_a", "z_s", "z_l"))),
+            "embedding": weights.embedding * losses.squared_norm(*(current[name] for name in latents)),
             "white_light": weights.white_light * _chroma(shading.lobes),
         }
         if skin_tone is not None:
             terms["skin_tone"] = weights.skin_tone * skin_tone
-        if stage.k_r > 0:
-            moved = x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(index)))).astype(np.float32))
-            rough = fine - albedo_refinement(network, a.refinement_octaves, moved, gamma)
-            base_diffuse = shading.diffuse * (base / dr.maximum(albedo, 1e-4))
-            terms["refinement"] = weights.refinement * self._refinement_loss(fine, base, base_diffuse, shading.specular)
-            terms["smoothness"] = weights.smoothness * losses.mean(dr.abs(rough))
-        if _refines_light(stage):
-            terms["shares"] = weights.shares * share_loss(base, albedo, of_light, self.shares[:, index])
         return terms
 
-    def _refinement_loss(self, fine, base, base_diffuse, specular_radiance):
-        """Eqs 12 and 13: ‖a^r‖ weighted by w, large in shadows and in reflections. The base albedo and the radiances
-        only weigh, they are not moved by this loss."""
-        weights = self.settings.appearance
-        shadow = dr.maximum(_norm_1(base) - _norm_1(base_diffuse), 0.0)
-        w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(specular_radiance))
-        length = dr.sqrt(dr.sum(fine * fine, axis=0) + 1e-8)
-        return losses.mean(length * w)
+    def _base_radiance(self, points: PhotoPoints) -> tuple[np.ndarray, np.ndarray]:
+        """Diffuse and specular radiance [3, n] of the base albedo at `points`, at the stage's first k_s."""
+        with dr.suspend_grad():
+            base = base_albedo(self.avatar, self._fixed, points)
+            shading = shade_points(self.avatar, self._fixed, self.stage.k_s[0], points, base)
+            return shading.diffuse.numpy(), shading.specular.numpy()
 
 
-def _refines_light(stage: Stage) -> bool:
-    return "light_refinement" in stage.rates
+class LightProblem(AppearanceProblem):
+    """The losses of the first appearance stage."""
+
+    def start(self, state: FitState) -> FitState:
+        """Scales the light to the photo's exposure, all channels alike: by the ratio of the photo's mean radiance to
+        that rendered with the prior's albedo."""
+        self.refresh(state)
+        index = self._draw(np.random.default_rng(0))
+        diffuse, _ = self._base_radiance(self.surface.points[index])
+        factor = self.surface.radiance[:, index].mean() / max(float(diffuse.mean()), 1e-6)
+        return state.with_parameters({"illumination": scale_light(self.avatar, state.avatar["illumination"], factor)})
 
 
-def exposed(avatar: Avatar, illumination_parameters: np.ndarray, factor: float) -> np.ndarray:
-    """Parameters of the illumination decoder whose lobes are brighter by about `factor`, by the bias of their
+def scale_light(avatar: Avatar, illumination: np.ndarray, factor: float) -> np.ndarray:
+    """Parameters of the illumination decoder whose lobes are about `factor` times as bright, by the bias of their
     log-amplitudes."""
-    flat = illumination_parameters.copy()
+    flat = illumination.copy()
     bias = flat[-7 * avatar.architecture.lobes :].reshape(-1, 7)
     bias[:, 4:7] += np.float32(np.log(max(factor, 1e-6)))
     return flat
 
 
-def _norm_1(v):
-    """‖v‖₁ of the columns of v [rows, N]: [N]."""
-    return dr.sum(dr.abs(v), axis=0)
-
-
-def _chroma(lobes):
+def _chroma(lobes: Any) -> Any:
     """Mean squared log-chroma of the lobes' amplitudes."""
     logarithm = dr.log(lobes[:, 4:7])
     grey = dr.reshape(dr.mean(logarithm, axis=1), (-1, 1))

@@ -1,14 +1,14 @@
-"""Runs the stages of a fit: one Adam a stage, in blocks of steps; checkpoints on block boundaries, resume to the same
-result. A block that diverges is taken back, and the steps from there on are shorter."""
+"""Runs the stages of a fit: one Adam a stage, in blocks of steps. Checkpoints fall between blocks, and a fit resumes
+from them to the same result. A block that diverges is undone, and the steps after it are shorter."""
 
 import json
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
-from sira_mi.fit.settings import Stage
+from sira_mi.fit.stage import Problem, Stage
+from sira_mi.fit.state import FitState
 from sira_mi.optimisation.adam import (
     adam,
     optimizer_state,
@@ -27,10 +28,10 @@ from sira_mi.optimisation.adam import (
 )
 
 _CHECKPOINT_SECONDS = 10.0
-# A block has diverged when one of its losses is above this multiple of the stage's lowest and its later half has not
-# come below that again. Healthy steps may rise as far (windows of the photo in turn, networks that start from 0), but
-# blocks hardly ever stay up, and shorter steps then cost little. A block's median alone would not do: a network that
-# one step has thrown off may come to rest, dead, hardly above where it began.
+# A block has diverged when one of its losses exceeds this multiple of the stage's lowest median and the losses of its
+# later half stay above that median. Single losses of a healthy fit may rise as far, since windows of the photo take
+# turns and some networks start from 0; they hardly ever stay there. The median alone is no test: a network that a long
+# step has killed can come to rest with a loss little above the first.
 _DIVERGED = 2.5
 # How often the learning rates of a stage may be halved.
 _MOST_ROLLBACKS = 12
@@ -40,25 +41,11 @@ class DivergedError(Exception):
     """The fit runs away; the message says how."""
 
 
-class Problem(Protocol):
-    """What a stage optimises."""
-
-    def start(self, stage: Stage, tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Tensors that are set before the first step of a stage, by closed form rather than by descent."""
-
-    def refresh(self, tensors: dict[str, np.ndarray]) -> None:
-        """Rebuilds whatever may lag behind the parameters; called every block and a function of `tensors` alone. Raises
-        EmptySurfaceError when there is no head any more."""
-
-    def losses(self, tensors: dict, stage: Stage, step: int, rng: np.random.Generator) -> dict:
-        """Weighted loss terms; `tensors` holds the stage's parameters as Dr.Jit arrays."""
-
-
 @dataclass
 class Progress:
     """Where a fit stands: the start of the last block of a stage that went well. What a checkpoint holds."""
 
-    tensors: dict[str, np.ndarray]  # avatar tensors so far
+    state: FitState
     stage: int = 0
     step: int = 0
     optimizer: dict[str, np.ndarray] | None = None  # state of the stage's Adam, None before its start
@@ -68,11 +55,15 @@ class Progress:
     losses: dict[str, dict[str, float]] = field(default_factory=dict)  # last terms of each stage
     notes: list[str] = field(default_factory=list)  # what the user should know, one line each
 
+    def finish_stage(self) -> None:
+        """Goes on to the start of the next stage."""
+        self.stage, self.step, self.optimizer = self.stage + 1, 0, None
+        self.lowest, self.rollbacks = None, 0
+
 
 def save_progress(path: Path, progress: Progress, identity: str) -> None:
-    """Writes a checkpoint; `identity` names the photo, settings and seed that it belongs to."""
-    arrays = {f"tensor/{k}": v for k, v in progress.tensors.items()}
-    arrays |= {f"adam/{k}": v for k, v in (progress.optimizer or {}).items()}
+    """Writes a checkpoint; `identity` names the fit that it belongs to."""
+    arrays = progress.state.arrays() | {f"adam/{k}": v for k, v in (progress.optimizer or {}).items()}
     described = ("stage", "step", "lowest", "rollbacks", "seconds", "losses", "notes")
     description = {k: getattr(progress, k) for k in described}
     write_arrays(path, arrays, {"identity": identity, "progress": json.dumps(description)})
@@ -83,92 +74,104 @@ def load_progress(path: Path, identity: str) -> Progress:
     arrays, metadata = read_arrays(path)
     if metadata.get("identity") != identity:
         raise InputError(
-            f"{path} belongs to another photo, quality, seed or prior; choose another --out or drop --resume"
+            f"{path} belongs to another photo, quality, seed, prior, variant or version; choose another --out or drop "
+            "--resume"
         )
     try:
+        optimizer = {k.removeprefix("adam/"): v for k, v in arrays.items() if k.startswith("adam/")}
         description = json.loads(metadata["progress"])
-        groups = {
-            kind: {k.removeprefix(kind): v for k, v in arrays.items() if k.startswith(kind)}
-            for kind in ("tensor/", "adam/")
-        }
-        return Progress(tensors=groups["tensor/"], optimizer=groups["adam/"] or None, **description)
+        return Progress(FitState.from_arrays(arrays), optimizer=optimizer or None, **description)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); remove it to start again") from error
 
 
 def run_stages(
-    stages: list[tuple[Callable[[dict], Problem], Stage]],
+    stages: Sequence[Stage],
+    make_problem: Callable[[Stage, FitState], Problem],
     progress: Progress,
     block: int,
     seed: int,
     checkpoint: Callable[[Progress], None],
 ) -> Progress:
-    """Runs every stage from where `progress` stands. Each entry of `stages` is a function from the current tensors to
-    the stage's problem, and the stage. On KeyboardInterrupt the parameters so far are kept and the exception goes on.
+    """Runs every stage from where `progress` stands, which follows; `make_problem` gives the problem of a stage from a
+    state on. On KeyboardInterrupt the parameters so far are kept and the exception goes on.
 
-    A block that diverges (`_run_block`) is taken back to the start of the last one that went well, with half the
-    learning rates for the rest of its stage, and a note says so. Raises InputError when that does not help."""
-    total = sum(stage.steps for _, stage in stages)
-    done = sum(stage.steps for _, stage in stages[: progress.stage])
-    saved = time.monotonic()
+    A block that diverges (`_run_block`) is undone: the stage goes on from the last block that went well, at half the
+    learning rates, and a note says so. Raises InputError when that does not help."""
+    run = _Run(progress, block, seed, checkpoint)
+    total, done = (sum(stage.steps for stage in some) for some in (stages, stages[: progress.stage]))
     with tqdm(total=total, initial=done + progress.step, desc="fit", unit="step", mininterval=1, smoothing=0.05) as bar:
-        while progress.stage < len(stages):
-            make_problem, stage = stages[progress.stage]
-            problem = make_problem(progress.tensors)
-            if progress.optimizer is None:
-                progress.tensors |= problem.start(stage, progress.tensors)
-            optimizer = adam({k: progress.tensors[k] for k in stage.rates}, stage.rates, beta_2=0.98)
-            if progress.optimizer is None:
-                progress.optimizer = optimizer_state(optimizer)
-            restore_optimizer(optimizer, progress.optimizer)
-            started = time.monotonic()
-            step = progress.step
-            try:
-                while step < stage.steps:
-                    steps = range(step, min(step + block, stage.steps))
-                    tensors, state = progress.tensors | parameter_values(optimizer), optimizer_state(optimizer)
-                    try:
-                        median = _run_block(problem, optimizer, stage, steps, tensors, progress, seed, bar)
-                    except (DivergedError, EmptySurfaceError) as error:
-                        _roll_back(stage, progress, error)
-                        restore_optimizer(optimizer, progress.optimizer)
-                        step = progress.step
-                        bar.n = done + step
-                        continue
-                    progress.tensors, progress.step, progress.optimizer = tensors, step, state
-                    progress.lowest = median if progress.lowest is None else min(median, progress.lowest)
-                    step = steps.stop
-                    if time.monotonic() - saved > _CHECKPOINT_SECONDS:
-                        progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
-                        started = saved = time.monotonic()
-                        checkpoint(progress)
-            finally:
-                progress.tensors |= parameter_values(optimizer)
-                progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+        for stage in stages[progress.stage :]:
+            _run_stage(run, stage, make_problem(stage, progress.state), bar, done)
             done += stage.steps
-            progress.stage, progress.step, progress.optimizer = progress.stage + 1, 0, None
-            progress.lowest, progress.rollbacks = None, 0
+            progress.finish_stage()
         bar.set_postfix_str("done")
     return progress
 
 
+@dataclass
+class _Run:
+    """What is the same for all stages of a fit."""
+
+    progress: Progress
+    block: int  # steps
+    seed: int
+    checkpoint: Callable[[Progress], None]
+    saved: float = field(default_factory=time.monotonic)  # when the last checkpoint was written
+
+
+def _run_stage(run: _Run, stage: Stage, problem: Problem, bar: tqdm, done: int) -> None:
+    """Runs a stage from where the progress stands to its end; `done` steps lie before the stage."""
+    progress = run.progress
+    if progress.optimizer is None:
+        progress.state = problem.start(progress.state)
+    optimizer = adam(progress.state.parameters(stage.rates), stage.rates, beta_2=0.98)
+    if progress.optimizer is None:
+        progress.optimizer = optimizer_state(optimizer)
+    restore_optimizer(optimizer, progress.optimizer)
+    started = time.monotonic()
+    step = progress.step
+    try:
+        while step < stage.steps:
+            steps = range(step, min(step + run.block, stage.steps))
+            state, moments = progress.state.with_parameters(parameter_values(optimizer)), optimizer_state(optimizer)
+            try:
+                median = _run_block(problem, optimizer, stage, steps, state, progress, run.seed, bar)
+            except (DivergedError, EmptySurfaceError) as error:
+                _roll_back(stage, progress, error)
+                restore_optimizer(optimizer, progress.optimizer)
+                step = progress.step
+                bar.n = done + step
+                continue
+            progress.state, progress.step, progress.optimizer = state, step, moments
+            progress.lowest = median if progress.lowest is None else min(median, progress.lowest)
+            step = steps.stop
+            if time.monotonic() - run.saved > _CHECKPOINT_SECONDS:
+                progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+                started = run.saved = time.monotonic()
+                run.checkpoint(progress)
+    finally:
+        progress.state = progress.state.with_parameters(parameter_values(optimizer))
+        progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
+
+
 def _run_block(
     problem: Problem,
-    optimizer,
+    optimizer: Any,
     stage: Stage,
     steps: range,
-    tensors: dict[str, np.ndarray],
+    state: FitState,
     progress: Progress,
     seed: int,
     bar: tqdm,
 ) -> float:
-    """Takes some steps from `tensors` on; returns the median of their losses.
+    """Takes some steps from `state` on; returns the median of their losses.
 
-    Raises DivergedError when a loss or a parameter is not finite, or a loss is far above the lowest of the stage (in
-    the first block, above the loss before the first step), the losses stay above it and shorter steps may help;
-    EmptySurfaceError when there is no head before the block or after the stage's last."""
-    problem.refresh(tensors)
-    totals = []
+    Raises DivergedError when a loss or a parameter is not finite, or when the losses rise and stay high (`_DIVERGED`;
+    in the first block, compared with the loss before the first step) and the learning rates can still be halved.
+    Raises EmptySurfaceError when there is no head before the block or after the stage's last."""
+    problem.refresh(state)
+    totals: list[float] = []
     for step in steps:
         rng = np.random.default_rng([seed, progress.stage, step])
         terms = _step(problem, optimizer, stage, step, 0.5**progress.rollbacks, rng)
@@ -186,7 +189,7 @@ def _run_block(
     if max(totals) > _DIVERGED * before and stays and progress.rollbacks < _MOST_ROLLBACKS:
         raise DivergedError(f"the loss rose from {before:.3g} to {max(totals):.3g}")
     if steps.stop == stage.steps:
-        problem.refresh(tensors | values)
+        problem.refresh(state.with_parameters(values))
     return float(np.median(totals))
 
 
@@ -207,13 +210,13 @@ def _roll_back(stage: Stage, progress: Progress, error: Exception) -> None:
 
 
 def _step(
-    problem: Problem, optimizer, stage: Stage, step: int, factor: float, rng: np.random.Generator
+    problem: Problem, optimizer: Any, stage: Stage, step: int, factor: float, rng: np.random.Generator
 ) -> dict[str, float]:
     """One step with `factor` times the stage's learning rates; the loss terms before it."""
     rates = {name: factor * rate * _fall(step / stage.steps) for name, rate in stage.rates.items()}
     optimizer.set_learning_rate(rates)
     dr.enable_grad(*(optimizer[name] for name in optimizer))
-    terms = problem.losses(dict(optimizer.items()), stage, step, rng)
+    terms = problem.losses(dict(optimizer.items()), step, rng)
     dr.backward(sum(terms.values()))
     optimizer.step()
     return {name: float(value.numpy().item()) for name, value in terms.items()}

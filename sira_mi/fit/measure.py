@@ -1,4 +1,4 @@
-"""What the decisions of a fit's plan really cost and save: each alone, on one step of its stage."""
+"""The error and the time saved of each decision of a fit, measured alone on one step of its stage."""
 
 from __future__ import annotations
 
@@ -9,32 +9,46 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.decisions import Decision, Plan
-from sira_mi.fit.settings import APPEARANCE, FitSettings, Stage
+from sira_mi.fit.stage import FitTask, Stage
+from sira_mi.fit.state import FitState
 from sira_mi.relight.measure import measure_saving
 
 
-def measured_fit(plan: Plan, problem, settings: FitSettings, tensors: dict[str, np.ndarray]) -> Plan:
-    """The plan with the error and the time saved of all that it leaves out of the stages of an `AppearanceProblem`, at
-    the avatar tensors `tensors`, and where these have none, at what a stage starts from."""
-    stages = {stage.name: stage for kind, stage in settings.stages if kind == APPEARANCE}
-    for stage in stages.values():
-        tensors = {**problem.start(stage, tensors), **tensors}
-    problem.refresh(tensors)
+def measure_fit(task: FitTask, state: FitState) -> Plan:
+    """The plan of `task` with error and saved time of every decision, at what its stage would start from after
+    `state`."""
+    return Plan(
+        tuple(
+            _measure(decision, task, stage, state)
+            for stage in task.settings.stages
+            for decision in task.plan.decisions
+            if decision.where == stage.name
+        )
+    )
 
-    def gradient(stage: Stage, chosen: Plan) -> np.ndarray:
-        problem.plan = chosen
-        parameters = {name: mi.Float(tensors[name]) for name in stage.rates}
+
+def _measure(decision: Decision, task: FitTask, stage: Stage, state: FitState) -> Decision:
+    if not decision.left_out:
+        return decision
+    steps = [_Step(task.with_plan(Plan((one,))), stage, state) for one in (replace(decision, left_out=False), decision)]
+    kept, left_out = (step.gradient() for step in steps)
+    error = float(np.abs(left_out - kept).max() / max(np.abs(kept).max(), 1e-30))
+    saved, spread = measure_saving(*(step.gradient for step in steps))
+    return replace(decision, error=error, saved=saved, saved_spread=spread)
+
+
+class _Step:
+    """The middle step of a stage."""
+
+    def __init__(self, task: FitTask, stage: Stage, state: FitState):
+        self.stage, self.problem = stage, stage.problem(task, state)
+        self.state = self.problem.start(state)
+        self.problem.refresh(self.state)
+
+    def gradient(self) -> np.ndarray:
+        """The gradient of the losses by all of the stage's parameters, one after the other."""
+        parameters = {name: mi.Float(value) for name, value in self.state.parameters(self.stage.rates).items()}
         dr.enable_grad(*parameters.values())
-        terms = problem.losses(parameters, stage, stage.steps // 2, np.random.default_rng(0))
+        terms = self.problem.losses(parameters, self.stage.steps // 2, np.random.default_rng(0))
         dr.backward(sum(terms.values()))
         return np.concatenate([dr.grad(value).numpy().ravel() for value in parameters.values()])
-
-    def measure(decision: Decision) -> Decision:
-        stage = stages[decision.where]
-        kept = Plan((replace(decision, left_out=False),))
-        first, second = gradient(stage, kept), gradient(stage, Plan((decision,)))
-        error = float(np.abs(second - first).max() / max(np.abs(first).max(), 1e-30))
-        saved, spread = measure_saving(lambda: gradient(stage, kept), lambda: gradient(stage, Plan((decision,))))
-        return replace(decision, error=error, saved=saved, saved_spread=spread)
-
-    return Plan(tuple(measure(d) if d.left_out and not d.built_in else d for d in plan.decisions))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,6 @@ from sira_mi.export.scene import sensor
 from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import surface
-from sira_mi.plugins.neural_sdf import trace_head
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.sg.radiance import Material, closed_form_radiance
@@ -22,6 +22,8 @@ from sira_mi.sg.visibility import SHADOW_OFFSET, even_directions, light_visibili
 
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
+
+Points = TypeVar("Points", bound="SeenPoints")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class SeenPoints:
     gamma: np.ndarray  # [N_γ, N]
     normal: np.ndarray  # [3, N] unit
 
-    def __getitem__(self, index: np.ndarray) -> SeenPoints:
+    def __getitem__(self: Points, index: np.ndarray) -> Points:
         return type(self)(*(np.ascontiguousarray(getattr(self, f.name)[..., index]) for f in fields(self)))
 
 
@@ -50,6 +52,8 @@ class PhotoPoints(SeenPoints):
 
 def seen_points(camera: Camera, head) -> SeenPoints:
     """The points of a `neural_sdf` that a camera sees."""
+    from sira_mi.plugins.neural_sdf import trace_head  # exists only under a variant
+
     scene = mi.load_dict({"type": "scene", "sensor": sensor(camera), "head": head})
     index = dr.arange(mi.UInt32, camera.height * camera.width)
     centre = mi.Point2f(
@@ -66,17 +70,19 @@ def seen_points(camera: Camera, head) -> SeenPoints:
     return SeenPoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
 
 
-def photo_points(portrait: Portrait, head, shadows: bool = True) -> PhotoPoints:
-    """The points of a `neural_sdf` that the portrait shows inside its mask; without `shadows`, open to all sides."""
+def masked_points(portrait: Portrait, head) -> SeenPoints:
+    """The points of a `neural_sdf` that the portrait shows inside its mask."""
     seen = seen_points(portrait.camera, head)
-    seen = seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
-    if not shadows:
-        return PhotoPoints(**vars(seen), unoccluded=np.ones((DIRECTIONS, len(seen.row)), bool))
+    return seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
+
+
+def photo_points(portrait: Portrait, head) -> PhotoPoints:
+    """The points of a `neural_sdf` that the portrait shows inside its mask, and their visibility."""
+    seen = masked_points(portrait, head)
     scene = mi.load_dict({"type": "scene", "head": head})
     place = seen.origin + seen.t * seen.view
-    unoccluded = trace_unoccluded(
-        scene, place, seen.normal, even_directions(DIRECTIONS).axis, SHADOW_OFFSET * head.voxel
-    )
+    axes = even_directions(DIRECTIONS).axis
+    unoccluded = trace_unoccluded(scene, place, seen.normal, axes, SHADOW_OFFSET * head.voxel)
     return PhotoPoints(**vars(seen), unoccluded=unoccluded)
 
 

@@ -16,10 +16,11 @@ import sira_mi
 from sira_mi.avatar.file import PRIOR, load_avatar, save_avatar
 from sira_mi.decisions import Plan
 from sira_mi.files import write_through
-from sira_mi.fit.fit import FitRequest, initial_tensors, read_portrait, stage_problems
-from sira_mi.fit.leave_out import plan_fit
-from sira_mi.fit.measure import measured_fit
-from sira_mi.fit.settings import APPEARANCE, QUALITIES
+from sira_mi.fit.fit import FitRequest, read_portrait
+from sira_mi.fit.measure import measure_fit
+from sira_mi.fit.settings import QUALITIES
+from sira_mi.fit.stage import FitTask
+from sira_mi.fit.state import initial_state
 from sira_mi.relight.leave_out import TOLERANCE, plan_relight
 from sira_mi.relight.measure import measure_plan
 from sira_mi.relight.render import RelightSettings, load_head
@@ -41,7 +42,7 @@ def plan_table(plan: Plan) -> str:
     """A Markdown table of the decisions."""
     lines = [_row("decision", "about", "", "condition", "bound", "measured", "noise", "time saved"), _row(*["---"] * 8)]
     for d in plan.decisions:
-        verdict = "needed" if not d.left_out else "built in" if d.built_in else "left out"
+        verdict = "left out" if d.left_out else "needed"
         saved = "–" if d.saved is None else f"{100 * d.saved:.0f} ± {100 * d.saved_spread:.0f} %"
         figures = [_number(d.bound), _number(d.error), _number(d.noise), saved] if d.left_out else ["–"] * 4
         lines.append(_row(d.name, d.where, verdict, d.reason, *figures))
@@ -113,9 +114,8 @@ def _fit_section() -> str:
     prior = load_avatar(PRIOR)
     with tempfile.TemporaryDirectory() as folder:
         portrait = read_portrait(FitRequest(None, Path(folder), example=True), settings, prior)
-        tensors = initial_tensors(prior, 0)
-        problem = stage_problems(portrait, prior, PRIOR, Path(folder), settings)[APPEARANCE](tensors)
-        return plan_table(measured_fit(plan_fit(settings), problem, settings, tensors))
+        task = FitTask(portrait, prior, PRIOR, settings, Path(folder), settings.plan())
+        return plan_table(measure_fit(task, initial_state(prior, 0)))
 
 
 def write_page(folder: Path, avatar: Path, lights: Path | None, size: int, voxel: float) -> Path:

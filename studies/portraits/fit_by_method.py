@@ -18,9 +18,10 @@ from sira_mi.errors import InputError
 from sira_mi.files import write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress
-from sira_mi.fit.fit import finished_avatar, fit_portrait, initial_tensors, with_pose
-from sira_mi.fit.settings import FitSettings
+from sira_mi.fit.fit import assemble_avatar, fit_portrait
 from sira_mi.fit.shaded import seen_points
+from sira_mi.fit.stage import FitSettings
+from sira_mi.fit.state import FitState, initial_state
 from sira_mi.optimisation.adam import read_arrays, write_arrays
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
@@ -39,16 +40,17 @@ def fit_and_write(job: Job) -> dict:
     )
     seconds = {"portrait": round(time.monotonic() - started, 2)}
     if job.before is None:
-        tensors = initial_tensors(prior, job.seed)
+        state = initial_state(prior, job.seed)
     else:
-        tensors, _ = read_arrays(job.before / "tensors.safetensors")
-    progress = Progress(method.start(prior, tensors, job.seed))
+        state = FitState.from_arrays(read_arrays(job.before / "tensors.safetensors")[0])
+    progress = Progress(method.start(prior, state, job.seed))
     with tempfile.TemporaryDirectory() as work:
-        fit_portrait(portrait, job.prior, settings, job.seed, Path(work), progress)
-    write_arrays(job.out / "tensors.safetensors", progress.tensors, {})
-    avatar = finished_avatar(prior, progress, settings)
+        task = method.task(portrait, prior, job.prior, settings, Path(work), settings.plan())
+        fit_portrait(task, progress, job.seed)
+    write_arrays(job.out / "tensors.safetensors", progress.state.arrays(), {})
+    avatar = assemble_avatar(prior, progress, settings)
     save_avatar(job.out / "avatar.safetensors", avatar)
-    camera = _photo_camera(job.photo, with_pose(portrait, progress.tensors).camera)
+    camera = _photo_camera(job.photo, task.pose_portrait(progress.state).camera)
     _write_head(job.out, method, prior, camera, settings)
     return {
         "seconds": {**seconds, **{k: round(v, 2) for k, v in progress.seconds.items()}},

@@ -1,10 +1,10 @@
 """One fit of a portrait by a method: its inputs, what its result depends on, and the result that is on disk."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, POLISH, SHADING, FitSettings
+from sira_mi.fit.stage import FitSettings
 from studies.cache import fingerprint
 from studies.portraits.methods import BY_NAME
 
@@ -23,13 +23,9 @@ class Job:
     variant: str = "llvm_ad_rgb"
 
     def key(self) -> str:
-        """Hash of everything that the result depends on. Weights count only where the method has a stage that uses
-        them; the shading stage uses those of the geometry."""
+        """Hash of everything that the result depends on."""
         settings = BY_NAME[self.method].settings(self.settings)
-        kinds = {GEOMETRY if kind == SHADING else kind for kind, _ in settings.stages}
-        optional = {GEOMETRY, APPEARANCE, POLISH} - kinds
-        used = {name: value for name, value in asdict(settings).items() if name not in optional}
-        described = json.dumps([self.method, self.seed, used])
+        described = json.dumps([self.method, self.seed, settings.describe()])
         before = [self.before / "fit.json"] if self.before else []
         return fingerprint(described, self.photo, self.prior, *before)
 

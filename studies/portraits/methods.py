@@ -8,20 +8,42 @@ paper does.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from sira_mi.avatar.file import Avatar
 from sira_mi.fields.mlp import initial_parameters
-from sira_mi.fit.settings import APPEARANCE, GEOMETRY, SHADING, FitSettings, Stage, polish_stage, with_shading
+from sira_mi.fit.appearance import AppearanceStage
+from sira_mi.fit.geometry import GeometryStage
+from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
+from sira_mi.fit.settings import add_shading, polish_stage
+from sira_mi.fit.shaded import DIRECTIONS, PhotoPoints, masked_points
+from sira_mi.fit.shading import ShadingStage
+from sira_mi.fit.stage import FitSettings, FitTask, Stage
+from sira_mi.fit.state import FitState
+from sira_mi.portrait.portrait import Portrait
 from sira_mi.training.af_sm import initial_appearance_model
 
 # Of b.4, at draft quality.
 _SHADING_STEPS = 40
 
-Tensors = dict[str, np.ndarray]
-Stages = tuple[tuple[str, Stage], ...]
+Stages = tuple[Stage, ...]
+
+
+class UntrainedRadianceTask(FitTask):
+    """A fit whose rendering network is untrained: it expects no exposure."""
+
+    def exposure(self) -> float:
+        return 1.0
+
+
+class UnshadowedTask(FitTask):
+    """A fit in which nothing blocks the light."""
+
+    def photo_points(self, portrait: Portrait, head) -> PhotoPoints:
+        seen = masked_points(portrait, head)
+        return PhotoPoints(**vars(seen), unoccluded=np.ones((DIRECTIONS, len(seen.row)), bool))
 
 
 @dataclass(frozen=True)
@@ -31,92 +53,99 @@ class Method:
     name: str
     title: str
     stages: Callable[[Stages], Stages]  # of the shipped fit's stages, those that this method runs
-    start: Callable[[Avatar, Tensors, int], Tensors]  # (prior, tensors, seed) -> tensors before the first stage
+    start: Callable[[Avatar, FitState, int], FitState]  # (prior, state, seed) -> state before the first stage
     after: str | None = None  # the method whose result it goes on from
-    shadows: bool = True
+    task: type[FitTask] = FitTask
 
     def settings(self, settings: FitSettings) -> FitSettings:
         """The settings of a fit by this method at the quality of `settings`."""
-        return replace(
-            settings,
-            stages=self.stages(settings.stages),
-            shadows=self.shadows,
-            learned_radiance=self.start is not _untrained_rendering,
-        )
+        return replace(settings, stages=self.stages(settings.stages))
 
 
-def _of_kind(kind: str) -> Callable[[Stages], Stages]:
-    return lambda stages: tuple(entry for entry in stages if entry[0] == kind)
+def is_geometry(stage: Stage) -> bool:
+    """Whether a stage comes before the appearance and fits the shape."""
+    return isinstance(stage, GeometryStage) and not isinstance(stage, ShadingStage)
 
 
-def _unchanged(prior: Avatar, tensors: Tensors, seed: int) -> Tensors:
-    return tensors
+def _geometry(shipped: Stages) -> Stages:
+    return tuple(stage for stage in shipped if is_geometry(stage))
 
 
-def _untrained_rendering(prior: Avatar, tensors: Tensors, seed: int) -> Tensors:
-    """The rendering function as a training starts it."""
+def _unchanged(prior: Avatar, state: FitState, seed: int) -> FitState:
+    return state
+
+
+def _untrained_rendering(prior: Avatar, state: FitState, seed: int) -> FitState:
+    """The rendering network as a training starts it."""
     network = prior.architecture.networks["rendering"]
     parameters = initial_parameters(network, np.random.default_rng([seed, 7]), output_scale=0.3)
-    return {**tensors, "rendering": parameters}
+    return state.with_parameters({"rendering": parameters})
 
 
-def _untrained_appearance(prior: Avatar, tensors: Tensors, seed: int) -> Tensors:
+def _untrained_appearance(prior: Avatar, state: FitState, seed: int) -> FitState:
     """Albedo networks and light as a training starts them."""
     model = initial_appearance_model(prior.architecture, 1, seed)
     networks = {name: model[name] for name in ("diffuse_albedo", "specular_albedo", "illumination")}
-    return {**tensors, **networks, **{f"z_{k}": np.zeros_like(tensors[f"z_{k}"]) for k in "asl"}}
+    latents = {name: np.zeros_like(state.avatar[name]) for name in ("z_a", "z_s", "z_l")}
+    return state.with_parameters({**networks, **latents})
 
 
 def _rendering_from_scratch(shipped: Stages) -> Stages:
-    """The geometry stages with the rendering function, untrained before, optimised fast from the first on, and without
+    """The geometry stages with the rendering network, untrained before, optimised fast from the first on, and without
     its latent."""
     result = []
-    for kind, stage in _of_kind(GEOMETRY)(shipped):
+    for stage in _geometry(shipped):
         rates = {k: v for k, v in stage.rates.items() if k in ("z_sdf", "pose")}
         rates["rendering"] = max(stage.rates.get("rendering", 0.0), 2e-3)
         rates |= {k: v for k, v in stage.rates.items() if k == "deformation"}
-        result.append((kind, replace(stage, rates=rates)))
+        result.append(replace(stage, rates=rates))
     return tuple(result)
 
 
 def _without_prior(shipped: Stages) -> Stages:
     """One stage as long as all appearance stages, from untrained networks, without refinement."""
-    steps = sum(stage.steps for _, stage in _of_kind(APPEARANCE)(shipped))
+    steps = sum(stage.steps for stage in shipped if isinstance(stage, AppearanceStage))
     rates = {"illumination": 1e-3, "diffuse_albedo": 1e-3, "specular_albedo": 1e-3}
-    return ((APPEARANCE, Stage("without prior", steps, rates, k_s=(1.0, 1.0))),)
+    return (AppearanceStage("without prior", steps, rates, k_s=(1.0, 1.0)),)
 
 
 def _after_geometry(shipped: Stages) -> Stages:
-    return tuple(entry for entry in shipped if entry[0] != GEOMETRY)
+    return tuple(stage for stage in shipped if not is_geometry(stage))
 
 
 def _with_shading(shipped: Stages) -> Stages:
     """Those after the geometry with a shading stage, whether the quality has one or not."""
     stages = _after_geometry(shipped)
-    return stages if any(kind == SHADING for kind, _ in stages) else with_shading(stages, _SHADING_STEPS)
+    return stages if any(isinstance(s, ShadingStage) for s in stages) else add_shading(stages, _SHADING_STEPS)
 
 
 def _without_refinement(shipped: Stages) -> Stages:
-    return tuple((kind, stage) for kind, stage in _after_geometry(shipped) if stage.k_r == 0)
+    return tuple(stage for stage in _after_geometry(shipped) if not isinstance(stage, AlbedoRefinementStage))
 
 
 def _all_to_the_albedo(shipped: Stages) -> Stages:
     """The refinement of eq. 11 alone: that of the light stays 1."""
-    return tuple(
-        (kind, replace(stage, rates={k: v for k, v in stage.rates.items() if k != "light_refinement"}))
-        for kind, stage in _after_geometry(shipped)
-    )
+
+    def without_light(stage: Stage) -> Stage:
+        if not isinstance(stage, RefinementStage):
+            return stage
+        values = {field.name: getattr(stage, field.name) for field in fields(stage)}
+        return AlbedoRefinementStage(**values).hold("light_refinement")
+
+    return tuple(map(without_light, _after_geometry(shipped)))
 
 
 METHODS = (
-    Method("a.3", "deformation and reference", _rendering_from_scratch, _untrained_rendering),
-    Method("a.4", "SIRA: shape and appearance learned together", _of_kind(GEOMETRY), _unchanged),
+    Method(
+        "a.3", "deformation and reference", _rendering_from_scratch, _untrained_rendering, task=UntrainedRadianceTask
+    ),
+    Method("a.4", "SIRA: shape and appearance learned together", _geometry, _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
     Method("b.3", "with refinement: the shipped fit", _after_geometry, _unchanged, after="a.4"),
     Method("b.4", "as b.3, with a shading stage", _with_shading, _unchanged, after="a.4"),
     Method("b.5", "polished by path tracing", lambda shipped: (polish_stage(),), _unchanged, after="b.3"),
-    Method("b.6", "as b.3, without shadows", _after_geometry, _unchanged, after="a.4", shadows=False),
+    Method("b.6", "as b.3, without shadows", _after_geometry, _unchanged, after="a.4", task=UnshadowedTask),
     Method("b.7", "as b.3, all of the residual to the albedo", _all_to_the_albedo, _unchanged, after="a.4"),
 )
 BY_NAME = {method.name: method for method in METHODS}

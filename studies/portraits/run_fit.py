@@ -4,13 +4,13 @@ RUNS/PORTRAIT/METHOD holds what `fit_by_method` writes, and `fit.json`: times an
 """
 
 import multiprocessing
-import resource
 import shutil
 import time
 
 import mitsuba as mi
 
 from sira_mi.errors import InputError
+from sira_mi.fit.memory import peak_memory
 from studies.cache import write_json
 from studies.portraits.fit_job import Job
 
@@ -41,5 +41,5 @@ def _fit(job: Job) -> None:
     except InputError as error:
         result["error"] = str(error)
     result["total_seconds"] = round(time.monotonic() - started, 2)
-    result["peak_memory_megabytes"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    result["peak_memory_megabytes"] = round(peak_memory() / 2**20)
     write_json(job.out / "fit.json", result)

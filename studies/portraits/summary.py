@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sira_mi.fit.settings import GEOMETRY, QUALITIES, SHADING
+from sira_mi.fit.geometry import GeometryStage
+from sira_mi.fit.settings import QUALITIES
 from studies.portraits.compare_methods import MEAN_HEAD
 from studies.portraits.methods import BY_NAME
 
@@ -93,7 +94,7 @@ def _summarise_quality(rows: Sequence[dict], quality: str) -> dict:
 
 
 def _moves_the_shape(method: str, quality: str) -> bool:
-    return any(kind in (GEOMETRY, SHADING) for kind, _ in BY_NAME[method].settings(QUALITIES[quality]).stages)
+    return any(isinstance(s, GeometryStage) for s in BY_NAME[method].settings(QUALITIES[quality]).stages)
 
 
 def _costs_of_whole_fits(methods: dict[str, list[dict]]) -> dict[str, float | None]:

@@ -10,7 +10,8 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from sira_mi.files import write_png, write_text, write_through
-from sira_mi.fit.settings import QUALITIES, FitSettings
+from sira_mi.fit.settings import QUALITIES
+from sira_mi.fit.stage import FitSettings
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from studies.portraits.benchmark import EXIF_IFD, FOCAL_TAG, JPEG_QUALITY
@@ -27,7 +28,7 @@ _STEPS = {
     "details": 25,
     "light": 20,
     "albedo": 20,
-    "speculars": 20,
+    "specular": 20,
     "shading": 20,
     "refinement": 70,
 }
@@ -41,7 +42,7 @@ SETTINGS = replace(
     voxel=0.12,
     final_voxel=0.1,
     block=10,
-    stages=tuple((kind, replace(stage, steps=_STEPS[stage.name])) for kind, stage in QUALITIES["standard"].stages),
+    stages=tuple(replace(stage, steps=_STEPS[stage.name]) for stage in QUALITIES["standard"].stages),
 )
 REACH = 10  # pixels of the photo by which masks are eroded and dilated
 _HOLES, _HOLE_RADIUS = 12, 18  # number, and pixels
@@ -99,8 +100,8 @@ class Case:
     def settings(self) -> FitSettings:
         """The settings of its fit."""
         stages = tuple(
-            (kind, replace(stage, rates={name: self.rates * rate for name, rate in stage.rates.items()}))
-            for kind, stage in SETTINGS.stages
+            replace(stage, rates={name: self.rates * rate for name, rate in stage.rates.items()})
+            for stage in SETTINGS.stages
         )
         return replace(SETTINGS, stages=stages)
 

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,7 +50,7 @@ def run_fit(fit: Fit, work: Path) -> dict:
     `crashed`, the exit code; or `notes`, `face_mm`, `psnr_db`, `non_finite`, `closed` and `core_seconds`. A picture and
     what the fit printed stay in `work`."""
     case = fit.find_case()
-    described = json.dumps([fit.case, case.view, asdict(case.settings), fit.seed, fit.variant])
+    described = json.dumps([fit.case, case.view, case.settings.describe(), fit.seed, fit.variant])
     key = fingerprint(described, fit.truth / "truth.npz", PRIOR, *list_code())
     path = work / "fits" / f"{fit.case.replace(' ', '_')}_{fit.seed}.json"
     try:
@@ -104,8 +104,9 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
     from sira_mi.avatar.landmark_model import landmarks_of
     from sira_mi.fit import output
     from sira_mi.fit.driver import Progress
-    from sira_mi.fit.fit import finished_avatar, fit_portrait, initial_tensors, read_portrait, with_pose
-    from sira_mi.fit.settings import without
+    from sira_mi.fit.fit import assemble_avatar, fit_portrait, read_portrait
+    from sira_mi.fit.stage import FitTask
+    from sira_mi.fit.state import initial_state
     from sira_mi.portrait.camera import Camera
     from sira_mi.portrait.load import linear_to_srgb
     from sira_mi.portrait.portrait import area_resample
@@ -114,15 +115,16 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
 
     settings = fit.find_case().settings
     if given.camera is not None:
-        settings = without(settings, "pose")
+        settings = settings.hold("pose")
     prior = load_avatar(PRIOR)
     portrait = read_portrait(given.write(folder), settings, prior)
-    progress = Progress(initial_tensors(prior, fit.seed))
-    fit_portrait(portrait, PRIOR, settings, fit.seed, folder, progress)
-    avatar = finished_avatar(prior, progress, settings)
+    progress = Progress(initial_state(prior, fit.seed))
+    task = FitTask(portrait, prior, PRIOR, settings, folder, settings.plan())
+    fit_portrait(task, progress, fit.seed)
+    avatar = assemble_avatar(prior, progress, settings)
     save_avatar(folder / "avatar.safetensors", avatar)
 
-    camera = with_pose(portrait, progress.tensors).camera
+    camera = task.pose_portrait(progress.state).camera
     lobes = avatar.tensors["lobes"]
     scene = output.avatar_scene(str(folder / "avatar.safetensors"), camera, lobes, settings.final_voxel, in_photo=True)
     layers, head = output.render_layers(scene), scene.shapes()[0]
