@@ -17,7 +17,7 @@ from sira_mi.errors import InputError
 from sira_mi.portrait.camera import focal_from_exif
 from sira_mi.portrait.load import linear_to_srgb, load_photo
 from sira_mi.training.collection import skin
-from sira_mi.training.collection.lighting import lobe_map, map_directions
+from sira_mi.training.collection.lighting import map_directions, render_lobes
 from sira_mi.training.collection.render import Part, RenderSettings, build_scene, project, render_views
 from sira_mi.training.collection.sources.makehuman import MakeHumanSource
 from studies.portraits import benchmark
@@ -166,7 +166,7 @@ def test_shading_of_an_uneven_environment_against_quadrature(sphere):
     times cosine, and nothing is shadowed, though the photo's light sampling leaves out what is dim."""
     view = view_of([sphere])
     lobes = [_lobe(50, 10, HARD, np.ones(3)), _lobe(-60, 30, 3.0, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.1))]
-    light = lobe_map(np.array(lobes))
+    light = render_lobes(np.array(lobes))
     view.photograph(light, 1)
     irradiance, shadow = view.shading(2)
     inside = view.truth["region"] != 255
@@ -184,7 +184,7 @@ def test_shadow_of_an_occluder_under_a_hard_light():
     of the direct light, lit ones all of it, and both the photo and the shading are dark in the umbra."""
     parts = [ball(1.2, (0, 0, 0), (0.4, 0.4, 0.4), 0.3, 0), ball(0.3, (0.0, 0.6, 1.9), (0.4, 0.4, 0.4), 0.3, 1)]
     view = View(parts, EVEN, *portrait_camera(parts, -35, 0, 60, 5.0, 96), replace(TINY, size=96))
-    light = lobe_map(np.array([_lobe(0, 17.5, HARD, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.02))]))
+    light = render_lobes(np.array([_lobe(0, 17.5, HARD, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.02))]))
     radiance, _ = view.photograph(light, 1)
     irradiance, shadow = view.shading(2)
     normal, skinned = view.truth["normal"], view.truth["region"] == 0
@@ -239,7 +239,7 @@ def test_specular_strength_is_kept_in_levels(sphere):
 
 def test_roughness_of_each_region_enters_the_photo(sphere):
     """The same ball is another photo when its own region's roughness changes, the same when another region's does."""
-    light = lobe_map(np.array([_lobe(40, 20, 200.0, np.ones(3))]))
+    light = render_lobes(np.array([_lobe(40, 20, 200.0, np.ones(3))]))
     first, other, unused = (
         view_of([sphere], EVEN | change).photograph(light, 1)[0] for change in ({}, {skin.HAIR: 0.1}, {skin.CLOTH: 0.1})
     )
@@ -269,7 +269,7 @@ def test_lights_are_what_they_say():
     sines = np.sqrt(1 - directions[..., 1] ** 2) * (np.pi / 256) ** 2
     for sharpness in (12.0, HARD):
         towards = _lobe(30, 20, sharpness, np.ones(3))[:3]
-        image = lobe_map(_lobe(30, 20, sharpness, np.ones(3))[None], 256)
+        image = render_lobes(_lobe(30, 20, sharpness, np.ones(3))[None], 256)
         irradiance = (image[..., 0] * np.maximum(directions @ towards, 0) * sines).sum()
         assert irradiance == pytest.approx(1, rel=1.2 / sharpness + 0.01)
     for seed in range(5):

@@ -160,13 +160,13 @@ def test_hair_volume_encloses_the_sheets(hair_folder):
     mesh = hair.read_hair(hair_folder, "cap")
     fitted = hair.fit_hair(mesh, makehuman.identity_vertices(random_identity(0)))
     points, across, _ = hair.sample_sheets(mesh, fitted, np.random.default_rng(0))
-    vertices, triangles, normals = hair.hair_volume(points)
+    vertices, triangles, normals = hair.build_hair_volume(points)
     hull = trimesh.Trimesh(vertices, triangles, process=False)
     assert hull.is_watertight and hull.volume > 0
     assert (np.einsum("nd,nd->n", hull.vertex_normals, normals) > 0).mean() > 0.99
     assert winding_number(points[::200], vertices[triangles]).min() > 0.5
     assert 0.5 * hair.THICKNESS < np.median(cKDTree(vertices).query(points)[0]) < 3 * hair.VOXEL
-    for pattern in hair.strand_pattern(vertices, points, across, np.random.default_rng(0)):
+    for pattern in hair.draw_strand_pattern(vertices, points, across, np.random.default_rng(0)):
         assert np.isfinite(pattern).all() and 0.2 < pattern.std() < 2
 
 
@@ -399,7 +399,7 @@ def test_build_resumes_lists_errors_and_splits(variant, tmp_path, monkeypatch):
 
 def test_the_split_of_an_identity_does_not_depend_on_the_count():
     """One in eight of each source is a test identity, and seeds differ between sources and collections."""
-    assert [building.split_of(number) for number in (6, 7, 8, 15)] == ["train", "test", "train", "test"]
+    assert [building.choose_split(number) for number in (6, 7, 8, 15)] == ["train", "test", "train", "test"]
     settings = [building.BuildSettings((), seed, None, 1) for seed in (0, 1)]
     other = FakeSource()
     other.name = "other"

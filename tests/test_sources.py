@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
 from sira_mi.training.collection import annotation, skin
-from sira_mi.training.collection.annotation import axis_turns, check_landmarks, mean_head
+from sira_mi.training.collection.annotation import check_landmarks, list_axis_turns, mean_head
 from sira_mi.training.collection.landmarks import mesh_landmarks
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.sheet import encode_srgb
 from sira_mi.training.collection.similarity import Similarity, fit_robustly
 from sira_mi.training.collection.sources import meshes, valid
 from sira_mi.training.collection.sources.meshes import MeshSource
-from sira_mi.training.collection.sources.valid import ValidSource, group_of
+from sira_mi.training.collection.sources.valid import ValidSource, find_group
 from sira_mi.training.collection.subject import BrokenHead
 from sira_mi.training.collection.surface import BODY_FLOOR
 from sira_mi.training.collection.textured_surface import Surface, close_borders, place_index, refine
@@ -84,7 +84,7 @@ def test_alignment_recovers_a_similarity_in_spite_of_outliers():
 
 
 def test_the_axis_turns_are_all_rotations_of_a_cube():
-    turns = np.array(list(axis_turns()))
+    turns = np.array(list(list_axis_turns()))
     assert len({tuple(t.ravel().tolist()) for t in turns}) == 24
     assert np.allclose(np.linalg.det(turns), 1) and np.allclose(turns[0], np.eye(3))
 
@@ -326,8 +326,8 @@ def test_avatar_in_metres_keeps_its_size_and_gets_regions(person, avatar_folder)
 
 
 def test_avatar_names_give_groups():
-    assert group_of("NHPI_M_2") == {"ancestry": "NHPI", "sex": "male", "age": "adult"}
-    assert group_of("somebody") == {"ancestry": "unknown", "sex": "unknown", "age": "adult"}
+    assert find_group("NHPI_M_2") == {"ancestry": "NHPI", "sex": "male", "age": "adult"}
+    assert find_group("somebody") == {"ancestry": "unknown", "sex": "unknown", "age": "adult"}
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from sira_mi.files import write_through
 from sira_mi.portrait.landmarks import CHIN
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.build import VARIANT
-from sira_mi.training.collection.render import exposure
+from sira_mi.training.collection.render import find_exposure
 from sira_mi.training.collection.skin import CLOTH
 from sira_mi.training.collection.subject import BrokenHead, Source, Subject
 from studies.cache import write_json
@@ -190,7 +190,7 @@ def exposure_of(radiance, mask, truth, chin, light) -> float:
     row = (truth["K"] @ local)[1] / local[2]
     head[int(np.clip(row, 1, len(mask))) :] = 0
     albedo = (truth["diffuse_albedo"] @ weights * head).sum() / max(head.sum(), 1e-9)
-    scale = exposure(radiance, head, MEAN_LUMINANCE[light] * np.sqrt(albedo / USUAL_ALBEDO))
+    scale = find_exposure(radiance, head, MEAN_LUMINANCE[light] * np.sqrt(albedo / USUAL_ALBEDO))
     brightest = np.quantile(radiance[mask > 0.5].max(axis=-1), UNCLIPPED[light])
     return float(min(scale, 1 / max(brightest, 1e-9)))
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.training.collection.lighting import lobe_map, read_map, sky_map, white_balance
+from sira_mi.training.collection.lighting import draw_sky, find_white_balance, read_map, render_lobes
 
 LIGHTS = ("studio", "outdoor", "extreme")
 EXTREMES = ("side", "back", "coloured")
@@ -24,15 +24,15 @@ def light_map(light: str, random: np.random.Generator, yaw: float, environment: 
     """Radiance map [H, 2H, 3] of arbitrary scale. `yaw` is the camera's, degrees; `environment` is the file for
     `outdoor`, None for sun and sky; `extreme` is one of `EXTREMES`."""
     if light == "studio":
-        return lobe_map(_studio(random, yaw))
+        return render_lobes(_studio(random, yaw))
     if light == "extreme":
-        return lobe_map(_extreme(random, extreme))
+        return render_lobes(_extreme(random, extreme))
     if environment is None:
-        image, _ = sky_map(random)
+        image, _ = draw_sky(random)
     else:
         image = read_map(environment)
         image = np.roll(image, random.integers(image.shape[1]), axis=1)
-    return image * white_balance(image) ** BALANCE
+    return image * find_white_balance(image) ** BALANCE
 
 
 def backdrop(light: str, random: np.random.Generator, image: np.ndarray, directions: np.ndarray) -> np.ndarray:

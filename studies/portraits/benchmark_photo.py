@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.training.collection.render import Part, intrinsic_matrix, look_at, mesh_of
+from sira_mi.training.collection.render import Part, build_mesh, intrinsic_matrix, look_at
 from sira_mi.training.collection.skin import CLOTH, EYE, HAIR, SKIN
 
 NOTHING = 255  # region code of pixels off the person
@@ -71,7 +71,7 @@ def principled_mesh(name: str, part: Part, strength: float, roughness: dict[int,
             "specular": strength,
         }
     )
-    mesh = mesh_of(name, part, props)
+    mesh = build_mesh(name, part, props)
     rough = np.array([roughness[code] for code in range(len(roughness))])[part.region]
     mesh.add_attribute("face_roughness", 1, rough.tolist())
     mesh.add_attribute("face_region", 1, part.region.astype(float).tolist())

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError, run_command
-from sira_mi.training.collection.annotation import AnnotationSettings, consensus, mark_views
+from sira_mi.training.collection.annotation import AnnotationSettings, find_consensus, mark_views
 from sira_mi.training.collection.landmarks import BARYCENTRICS
 from sira_mi.training.collection.person import make_person
 from sira_mi.training.collection.skin import rest_surface
@@ -28,7 +28,7 @@ SETTINGS = AnnotationSettings(size=512, grid=2, expected_cosine=-1, search=True)
 FEWEST_MARKS = 5
 
 
-def marks_on_head(seed: int) -> np.ndarray:
+def mark_head(seed: int) -> np.ndarray:
     """Rest-pose positions [V, 468, 3] of the marks on one head, NaN where a mark does not meet the skin squarely; V is
     the number of views in which a face is found."""
     marks = mark_views(make_person(seed, None).parts, SETTINGS)
@@ -62,10 +62,10 @@ def main() -> None:
     parser.add_argument("--heads", type=int, default=16)
     arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    marks = [m for seed in tqdm(range(arguments.heads), unit="head") for m in marks_on_head(900_000 + seed)]
+    marks = [m for seed in tqdm(range(arguments.heads), unit="head") for m in mark_head(900_000 + seed)]
     if len(marks) < FEWEST_MARKS:
         raise InputError(f"only {len(marks)} faces were found on the pictures")
-    middle, number, spread = consensus(np.array(marks))
+    middle, number, spread = find_consensus(np.array(marks))
     valid = number >= FEWEST_MARKS
     if len(middle) != LANDMARKS or not valid.any():
         raise InputError("the landmark network returned no usable marks")

@@ -1,7 +1,7 @@
-"""The 468 face landmarks of any head, without correspondence: near-frontal renders are marked by the portrait landmark
-network, every mark is traced back onto the head, and a landmark is the median of its marks.
+"""The 468 face landmarks of a head without known correspondence.
 
-The landmarks also give the head its frame: they are aligned with those of the mean MakeHuman head (Umeyama 1991).
+The portrait landmark network marks near-frontal renders, each mark is traced back onto the head, and a landmark is the
+median of its marks. Alignment with the landmarks of the mean MakeHuman head gives the head its frame.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sira_mi.training.collection.render import (
     RenderSettings,
     build_scene,
     camera_position,
-    exposure,
+    find_exposure,
     intrinsic_matrix,
     look_at,
     project,
@@ -65,16 +65,16 @@ class AnnotationSettings:
     field_of_view: float = 14.0  # degrees
     distance: float = 14.0  # scene units
     smallest_cosine: float = 0.25  # between surface normal and view, below which a mark is not used
-    # Between the mean head's surface normal at a landmark and view, below which the mark is not used: the network puts
-    # landmarks that are turned away on the outline. -1 uses all.
+    # Between the mean head's surface normal at a landmark and the view, below which the mark is not used: the network
+    # puts landmarks that face away onto the outline. -1 uses all.
     expected_cosine: float = 0.5
     presence: float = 0.5  # the network's confidence below which a view is not used
-    search: bool = False  # find the face by the detector, not where the mean head has it
+    search: bool = False  # find the face by the detector instead of at the position of the mean head's
 
 
 @dataclass(frozen=True)
 class Marks:
-    """What the landmarks of each of V views hit."""
+    """The points of a head that the landmarks of each of V views hit."""
 
     points: np.ndarray  # [V, 468, 3] scene units; NaN where a mark does not meet skin or eyes squarely
     part: np.ndarray  # [V, 468] index of the part
@@ -107,7 +107,7 @@ def _mean_normals():
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 
 
-def cameras(settings: AnnotationSettings) -> tuple[np.ndarray, np.ndarray]:
+def place_cameras(settings: AnnotationSettings) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics [V, 3, 3] and world-to-camera matrices [V, 4, 4] of the near-frontal views."""
     target = np.array([0.0, 0.1, 0.4])
     poses = []
@@ -118,26 +118,26 @@ def cameras(settings: AnnotationSettings) -> tuple[np.ndarray, np.ndarray]:
 
 def mark_views(parts: list[Part], settings: AnnotationSettings) -> Marks:
     """Marks on a head in the project's frame, of the views in which a face is found."""
-    intrinsics, poses = cameras(settings)
-    scene, shown = photos(parts, intrinsics, poses, settings)
+    intrinsics, poses = place_cameras(settings)
+    scene, shown = take_photos(parts, intrinsics, poses, settings)
     rows = []
     for image, intrinsic, pose in zip(shown, intrinsics, poses, strict=True):
         face = _face(image, intrinsic, pose, settings)
         if face is not None:
             points, *hit = _trace(scene, parts, face.landmarks, intrinsic, pose, settings.smallest_cosine)
             if settings.expected_cosine > -1:
-                points[~_turned_to(pose, settings.expected_cosine)] = np.nan
+                points[~_is_turned_to(pose, settings.expected_cosine)] = np.nan
             rows.append((points, *hit))
     if not rows:
         return Marks(np.zeros((0, LANDMARKS, 3)), *(np.zeros((0, LANDMARKS), int),) * 2, np.zeros((0, LANDMARKS, 3)))
     return Marks(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
-def photos(
+def take_photos(
     parts: list[Part], intrinsics: np.ndarray, poses: np.ndarray, settings: AnnotationSettings
 ) -> tuple[mi.Scene, list[np.ndarray]]:
-    """The scene, and 8-bit pictures [H, W, 3] of it: diffuse reflection of distant lamps with their shadows. There is
-    no noise, which costs the landmark network more accuracy than the missing light costs."""
+    """The scene, and 8-bit pictures [H, W, 3] of it: diffuse reflection of distant lamps with their shadows. They
+    have no noise, which would cost the landmark network more accuracy than the simpler light does."""
     scene = build_scene(parts, np.zeros((2, 4, 3)), RenderSettings())
     size, grid = settings.size, settings.grid
     at = (np.arange(size * grid) + 0.5) / grid
@@ -159,7 +159,9 @@ def photos(
     shown = []
     for image in fine.mean((2, 4)):
         colour, cover = image[..., :3], image[..., 3]
-        shown.append(encode_srgb(colour * exposure(colour, cover, LUMINANCE) + BACKGROUND * (1 - cover[..., None])))
+        shown.append(
+            encode_srgb(colour * find_exposure(colour, cover, LUMINANCE) + BACKGROUND * (1 - cover[..., None]))
+        )
     return scene, shown
 
 
@@ -183,7 +185,7 @@ def _face(image, intrinsic, pose, settings):
     return face if face.presence >= settings.presence else None
 
 
-def _turned_to(pose, cosine):
+def _is_turned_to(pose, cosine):
     """Whether the mean head's landmarks [468] are turned to a camera."""
     way = camera_position(pose) - mean_head()[0]
     return (way * _mean_normals()).sum(1) > cosine * np.linalg.norm(way, axis=1)
@@ -214,7 +216,7 @@ def _trace(scene, parts, pixels, intrinsic, pose, smallest_cosine):
     return points, part, triangle, weights
 
 
-def consensus(marks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_consensus(marks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Median [468, 3], number of marks [468] and median distance from the median [468] of marks [R, 468, 3] with NaN
     gaps, in their unit; NaN where there is no mark."""
     number = np.isfinite(marks[..., 0]).sum(0)
@@ -233,15 +235,15 @@ def annotate(
 
     Raises BrokenHead when no view shows a face."""
     marks = mark_views(parts, settings or AnnotationSettings())
-    middle, number, spread = consensus(marks.points)
+    middle, number, spread = find_consensus(marks.points)
     valid = number > 0
     if not valid.any():
         raise BrokenHead("no face found on its renders")
-    middle[valid] = _onto_skin(middle[valid], parts)
+    middle[valid] = _move_onto_skin(middle[valid], parts)
     return np.where(valid[:, None], middle, 0), valid, spread * MILLIMETRES_PER_UNIT
 
 
-def _onto_skin(positions, parts):
+def _move_onto_skin(positions, parts):
     """The nearest points [N, 3] on skin."""
     lower, upper = positions.min(0) - 0.2, positions.max(0) + 0.2
     pieces = []
@@ -257,10 +259,10 @@ def _onto_skin(positions, parts):
 
 
 def find_face(parts: list[Part], turns: Iterator[np.ndarray] | list[np.ndarray]) -> Similarity:
-    """The similarity that takes a head of unknown place and size to the project's frame, roughly. `turns` are rotations
-    [3, 3] to try one after another: the first after which a face looks along +z is taken.
+    """A rough similarity that takes a head of unknown position and size to the project's frame. `turns` are rotations
+    [3, 3] to try in order: the first after which a face looks along +z is taken.
 
-    Raises BrokenHead when none does."""
+    Raises BrokenHead when no rotation shows a face."""
     everything = np.concatenate([part.vertices for part in parts])
     target, target_valid = mean_head()
     settings = AnnotationSettings(size=SEARCH_SIZE)
@@ -277,24 +279,24 @@ def find_face(parts: list[Part], turns: Iterator[np.ndarray] | list[np.ndarray])
         scale = SEARCH_SPAN / span
         first = Similarity(scale, turn, -scale * (lower + upper) / 2)
         placed = first.move(parts)
-        scene, shown = photos(placed, intrinsic, pose, settings)
+        scene, shown = take_photos(placed, intrinsic, pose, settings)
         for face in find_faces(shown[0])[:1]:
             points, *_ = _trace(scene, placed, face.landmarks, intrinsic[0], pose[0], settings.smallest_cosine)
             seen = target_valid & np.isfinite(points[:, 0])
             if seen.sum() < LANDMARKS // 3:
                 continue
             second = fit_robustly(points[seen], target[seen], scaled=True)
-            if misfit(second(points[seen]), target[seen]) < LARGEST_MISFIT:
+            if measure_misfit(second(points[seen]), target[seen]) < LARGEST_MISFIT:
                 return second.after(first)
     raise BrokenHead("no face found on it from any side")
 
 
-def misfit(points: np.ndarray, target: np.ndarray) -> float:
+def measure_misfit(points: np.ndarray, target: np.ndarray) -> float:
     """Median distance of points [N, 3] from their targets [N, 3], mm."""
     return float(np.median(np.linalg.norm(points - target, axis=1))) * MILLIMETRES_PER_UNIT
 
 
-def axis_turns() -> Iterator[np.ndarray]:
+def list_axis_turns() -> Iterator[np.ndarray]:
     """The 24 rotations that permute the axes, as [3, 3], those that keep a usual up axis first."""
     signed = [s * np.eye(3)[k] for k, s in product(range(3), (1, -1))]
     x, y, z = np.eye(3)
@@ -305,7 +307,7 @@ def axis_turns() -> Iterator[np.ndarray]:
             yield np.stack([np.cross(up, front), up, front])
 
 
-def place(
+def find_frame(
     parts: list[Part], rough: Similarity, natural_size: bool, settings: AnnotationSettings | None = None
 ) -> tuple[Similarity, np.ndarray, np.ndarray, np.ndarray]:
     """A head's frame and landmarks from a rough frame: the refined similarity (rigid beyond `rough` with
@@ -321,7 +323,7 @@ def place(
         if both.sum() < LANDMARKS // 3:
             raise BrokenHead(f"only {both.sum()} of {LANDMARKS} face landmarks can be seen")
         free = fit_robustly(landmarks[both], target[both], scaled=True)
-        if misfit(free(landmarks[both]), target[both]) > LARGEST_MISFIT:
+        if measure_misfit(free(landmarks[both]), target[both]) > LARGEST_MISFIT:
             raise BrokenHead("what the landmark network marked is no face")
         if natural_size and not NATURAL_SCALE[0] < free.scale < NATURAL_SCALE[1]:
             raise BrokenHead(f"its face is {1 / free.scale:.2f} times the mean face's size: not in the stated unit")

@@ -42,12 +42,12 @@ def scene_seed(settings: BuildSettings, source: Source, number: int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "little")
 
 
-def split_of(number: int) -> str:
+def choose_split(number: int) -> str:
     """`test` for one identity in `TEST_EVERY` of each source, else `train`."""
     return "test" if number % TEST_EVERY == TEST_REMAINDER else "train"
 
 
-def finished_info(path: Path) -> dict | None:
+def read_finished_info(path: Path) -> dict | None:
     """`info` of a scene file that holds every array of the layout, else None."""
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -61,8 +61,8 @@ def build_one(task: tuple[Source, int], out: Path, settings: BuildSettings, scen
     `error` when it failed."""
     source, number = task
     path, seed = out / scene_name(source, number), scene_seed(settings, source, number)
-    entry = {"file": path.name, "source": source.name, "number": number, "seed": seed, "split": split_of(number)}
-    info = finished_info(path)
+    entry = {"file": path.name, "source": source.name, "number": number, "seed": seed, "split": choose_split(number)}
+    info = read_finished_info(path)
     if info is not None and (info.get("name"), info.get("seed")) == (source.title(number), seed):
         return entry | _of_info(info)
     if mi.variant() != VARIANT:

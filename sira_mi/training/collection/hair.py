@@ -166,7 +166,7 @@ def sample_sheets(
     return points, coordinates[:, 0], strand[triangle]
 
 
-def hair_volume(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def build_hair_volume(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The closed surface around sheet samples [S, 3]: vertices [N, 3], triangles [T, 3] and outward normals [N, 3]."""
     margin = CLOSING + 4 * VOXEL
     lower = np.maximum(points.min(0), np.array(DOMAIN_LOWER) + 0.02) - margin
@@ -193,10 +193,10 @@ def hair_volume(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     volume = np.einsum("td,td->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     if volume < 0:
         triangles = triangles[:, ::-1]
-    return vertices, np.ascontiguousarray(triangles), _outward(vertices, normals, field, lower)
+    return vertices, np.ascontiguousarray(triangles), _find_normals(vertices, normals, field, lower)
 
 
-def _outward(vertices, normals, field, lower):
+def _find_normals(vertices, normals, field, lower):
     """Unit normals along the field's gradient, which grows outwards."""
     cell = ((vertices - lower) / VOXEL).T
     gradient = np.stack(
@@ -206,7 +206,7 @@ def _outward(vertices, normals, field, lower):
     return np.where(length > 1e-6, gradient / np.maximum(length, 1e-6), normals)
 
 
-def strand_pattern(
+def draw_strand_pattern(
     vertices: np.ndarray, points: np.ndarray, across: np.ndarray, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fine and coarse noise [N], each of about unit variance, that varies across the strands of the nearest sheet."""

@@ -76,7 +76,7 @@ def ict_control(path: Path, coefficients: np.ndarray) -> np.ndarray:
     arms lowered, mouth closed, eyes behind their lids. The first call for a file takes about ten seconds.
 
     Raises InputError when the file is missing or malformed, or holds no face."""
-    fit = _fitted(str(path), _stamp(Path(path)))
+    fit = _load_fitted(str(path), _stamp(Path(path)))
     coefficients = np.asarray(coefficients, float).ravel()
     if len(coefficients) > len(fit.modes) or not np.isfinite(coefficients).all():
         raise InputError(f"{path}: an identity takes up to {len(fit.modes)} finite coefficients")
@@ -110,7 +110,7 @@ def _stamp(path):
 
 
 @lru_cache(maxsize=2)
-def _fitted(path, stamp):
+def _load_fitted(path, stamp):
     return fit_basis(read_basis(Path(path)), path)
 
 
@@ -178,7 +178,7 @@ def _region() -> np.ndarray:
 def fit_basis(basis: Basis, path: str) -> Fitted:
     """Registers the MakeHuman mean adult to the basis; `path` is named in errors."""
     used = np.unique(load_pack().quads)
-    template, pairs = _aligned(basis, path)
+    template, pairs = _align(basis, path)
     triangles = head_topology()[0]
     refine = refinement()[0][:, used]
     index = np.full(len(template), -1)
@@ -205,7 +205,7 @@ def fit_basis(basis: Basis, path: str) -> Fitted:
     return Fitted(template, moved, modes, [basis.mean[e] for e in eyes], [basis.modes[:, e] for e in eyes])
 
 
-def _aligned(basis, path):
+def _align(basis, path):
     """The mean adult [19158, 3] brought to the size and place of the scans, upright as both are, and the rows of the
     landmarks that both have outside the lids."""
     control = identity_vertices(MEAN_ADULT)

@@ -10,7 +10,7 @@ import numpy as np
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait.face import find_faces
-from sira_mi.training.collection.lighting import lobe_map
+from sira_mi.training.collection.lighting import render_lobes
 from sira_mi.training.collection.registration import fit_sphere
 from sira_mi.training.collection.render import (
     Part,
@@ -125,7 +125,7 @@ def mark(basis: Basis, path: str) -> tuple[np.ndarray, Places, np.ndarray]:
         iris = step(unit[:, 2], 0.91, 0.93)[:, None]
         albedo = MARK_SCLERA + iris * np.subtract(MARK_IRIS, MARK_SCLERA)
         parts.append(_part(centre + radius * unit, triangles, unit, albedo))
-    scene = build_scene(parts, lobe_map(MARK_LIGHT), settings)
+    scene = build_scene(parts, render_lobes(MARK_LIGHT), settings)
     target = np.mean([fit_sphere(basis.mean[eye])[0] for eye in basis.eyes], axis=0) * [0, 1, 0.5] - [0, 0.2, 0]
     turns = np.radians(MARK_YAWS)
     poses = np.array([look_at(target + MARK_DISTANCE * np.array([np.sin(t), 0, np.cos(t)]), target) for t in turns])

@@ -30,25 +30,25 @@ def map_directions(height: int) -> np.ndarray:
 
 
 def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndarray, dict]:
-    """A radiance map of arbitrary scale and its description (JSON types; lobes are given for SG lights).
+    """A radiance map of arbitrary scale and its description (JSON types, with the lobes of SG lights).
 
-    Its colour is brought part of the way to neutral grey, as a camera's white balance does."""
+    Its colour is moved part of the way to neutral grey, as a camera's white balance does."""
     kinds = ("sg", "sky", "hdri") if hdri else ("sg", "sky")
     shares = (0.4, 0.2, 0.4) if hdri else (0.65, 0.35)
     kind = random.choice(kinds, p=shares)
     info: dict[str, Any] = {"kind": "sg"}
     if kind == "sg":
         lobes = sample_lobes(random)
-        image = lobe_map(lobes)
+        image = render_lobes(lobes)
     elif kind == "sky":
-        image, info = sky_map(random)
+        image, info = draw_sky(random)
     else:
         path = hdri[random.integers(len(hdri))]
         turn = float(random.uniform(0, 1))
         image = read_map(path)
         image = np.roll(image, round(turn * image.shape[1]), axis=1)
         info = {"kind": "hdri", "file": path.name, "turn": turn}
-    balance = white_balance(image) ** random.uniform(*BALANCE)
+    balance = find_white_balance(image) ** random.uniform(*BALANCE)
     info["balance"] = balance.tolist()
     if kind == "sg":
         lobes[:, 4:] *= balance
@@ -56,7 +56,7 @@ def sample_light(random: np.random.Generator, hdri: list[Path]) -> tuple[np.ndar
     return image * balance, info
 
 
-def white_balance(image: np.ndarray) -> np.ndarray:
+def find_white_balance(image: np.ndarray) -> np.ndarray:
     """Channel factors [3] that make the irradiance on a vertical plate facing +z neutral at the same luminance."""
     directions = map_directions(len(image))
     weight = np.maximum(directions[..., 2], 0) * np.sqrt(np.maximum(1 - directions[..., 1] ** 2, 0))
@@ -68,39 +68,47 @@ def sample_lobes(random: np.random.Generator) -> np.ndarray:
     """Lobes [N, 7] of axis, sharpness and RGB amplitude: a wide ambient one, a key light mostly from the front half,
     often a fill and a rim light, of plausible lamp colours."""
     lobes = [
-        np.concatenate([[0.0, 1.0, 0.0], [random.uniform(0.2, 1.0)], _tint(random, 0.25) * random.uniform(0.1, 0.5)])
+        np.concatenate(
+            [[0.0, 1.0, 0.0], [random.uniform(0.2, 1.0)], _draw_tint(random, 0.25) * random.uniform(0.1, 0.5)]
+        )
     ]
     key = random.uniform(8, 40)
-    lobes.append(_lobe(random, (-75, 75), (-5, 65), key, _tint(random, 0.35) * random.uniform(0.5, 1.0) * key * 0.12))
+    lobes.append(
+        _draw_lobe(random, (-75, 75), (-5, 65), key, _draw_tint(random, 0.35) * random.uniform(0.5, 1.0) * key * 0.12)
+    )
     if random.random() < 0.7:
         fill = random.uniform(2, 12)
-        lobes.append(_lobe(random, (-120, 120), (-25, 50), fill, _tint(random, 0.4) * random.uniform(0.1, 0.5)))
+        lobes.append(
+            _draw_lobe(random, (-120, 120), (-25, 50), fill, _draw_tint(random, 0.4) * random.uniform(0.1, 0.5))
+        )
     if random.random() < 0.4:
         rim = random.uniform(15, 60)
         lobes.append(
-            _lobe(random, (120, 240), (0, 60), rim, _tint(random, 0.5) * random.uniform(0.1, 0.8) * rim * 0.08)
+            _draw_lobe(
+                random, (120, 240), (0, 60), rim, _draw_tint(random, 0.5) * random.uniform(0.1, 0.8) * rim * 0.08
+            )
         )
     return np.array(lobes)
 
 
-def _lobe(random, yaw, elevation, sharpness, amplitude):
+def _draw_lobe(random, yaw, elevation, sharpness, amplitude):
     towards = point_towards(np.radians(random.uniform(*yaw)), np.radians(random.uniform(*elevation)))
     return np.concatenate([towards, [sharpness], amplitude])
 
 
-def _tint(random, strength):
+def _draw_tint(random, strength):
     """A lamp colour [3] of luminance 1 between warm and cool."""
     warmth = random.uniform(-strength, strength)
     colour = np.array([1 + warmth, 1 + 0.15 * random.uniform(-strength, strength), 1 - warmth])
     return colour / (colour @ np.array(LUMINANCE))
 
 
-def lobe_map(lobes: np.ndarray, height: int = MAP_HEIGHT) -> np.ndarray:
+def render_lobes(lobes: np.ndarray, height: int = MAP_HEIGHT) -> np.ndarray:
     """Radiance [H, 2H, 3] of lobes [N, 7]: the sum of amplitude · exp(sharpness (axis · direction − 1))."""
     return evaluate_lobes(lobes, map_directions(height))
 
 
-def sky_map(random: np.random.Generator) -> tuple[np.ndarray, dict]:
+def draw_sky(random: np.random.Generator) -> tuple[np.ndarray, dict]:
     """Mitsuba's sun and sky with the sun mostly in front, over grey ground."""
     azimuth, elevation = random.uniform(-110, 110), random.uniform(12, 65)
     turbidity, sun = random.uniform(*SKY_TURBIDITY), random.uniform(0.0, 0.6) ** 2

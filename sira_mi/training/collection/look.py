@@ -1,4 +1,4 @@
-"""What is drawn per person besides the shape: skin tone, hair, eyes and clothes, in line with age, sex and ancestry."""
+"""Appearance drawn at random for each person: skin tone, hair, eyes and clothes, by age, sex and ancestry."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ IRIS_COLOURS = {
 
 @dataclass(frozen=True)
 class Traits:
-    """What a look depends on."""
+    """The traits that a look depends on."""
 
     years: float  # age, years
     male: float  # 0 female to 1 male
@@ -38,7 +38,7 @@ class Traits:
 
 @dataclass(frozen=True)
 class Look:
-    """What is drawn per identity besides its shape; colours are linear."""
+    """The appearance of one person; colours are linear."""
 
     melanin: float  # 0 light to 1 dark
     haemoglobin: float  # standard deviations
@@ -64,7 +64,7 @@ class Look:
 
 
 def sample_look(random: np.random.Generator, traits: Traits, has_hair: bool) -> Look:
-    """Colours and details that go with age, sex and ancestry."""
+    """Draws colours and details by age, sex and ancestry."""
     share = np.array(traits.ancestry)
     melanin = float(np.clip(share @ MELANIN + random.normal(0, 0.1), 0, 1))
     hair_name = _hair_name(random, traits)

@@ -1,7 +1,7 @@
 """The outer surface of a person: oriented samples that can be seen from afar, and signed distances to them.
 
 A point belongs to the surface when at least `SIGHTINGS` of `DIRECTIONS` far directions see it, and the inside is
-whatever fewer of them reach, so hair, head and body form one solid without hidden pockets.
+everything that fewer of them reach. Hair, head and body so form one solid without hidden pockets.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ MARGIN = 0.01  # scene units between surface points and the domain's sides
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on the parts' surfaces with what is interpolated at them."""
+    """Points on the parts' surfaces with the values interpolated there."""
 
     points: np.ndarray  # [N, 3]
     normals: np.ndarray  # [N, 3]
@@ -80,8 +80,8 @@ def sample_parts(parts: list[Part], count: int, centre: np.ndarray, random: np.r
 
 
 def is_seen_from_afar(scene: "mi.Scene", points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
-    """Whether at least `SIGHTINGS` far directions reach a point, bool [N]; points on a surface are only asked in front
-    of it."""
+    """Whether at least `SIGHTINGS` far directions reach a point, bool [N]; with
+    normals, only directions in front of the surface count."""
     sightings = np.zeros(len(points), int)
     for direction in far_directions():
         ask = sightings < SIGHTINGS
@@ -95,7 +95,7 @@ def is_seen_from_afar(scene: "mi.Scene", points: np.ndarray, normals: np.ndarray
 
 
 def smooth_hair_normals(samples: Samples) -> np.ndarray:
-    """Normals [N, 3] with those of hair averaged over their neighbours, so that hair is a soft volume."""
+    """Normals [N, 3]; those of hair are averaged over their neighbours, which makes hair a soft volume."""
     normals = samples.normals.copy()
     hair = np.flatnonzero(samples.region == HAIR)
     if len(hair) > 8:

@@ -36,7 +36,7 @@ WAVE_RELIEF = 0.02
 
 @dataclass(frozen=True)
 class Cut:
-    """How a hair mesh is varied."""
+    """A hair mesh and its variation."""
 
     name: str
     mirrored: bool
@@ -84,7 +84,7 @@ def dress(control: np.ndarray, traits: Traits, random: np.random.Generator, hair
     if hair_folder is not None and wears:
         cut = sample_cut(random, hairs.list_hair(hair_folder), traits.male)
     look = sample_look(random, traits, cut is not None)
-    head, triangles, cloth = skin.body_under(control, look)
+    head, triangles, cloth = skin.dress_head(control, look)
     volume = None
     covered = np.zeros(len(head))
     if cut is not None:
@@ -103,7 +103,7 @@ def dress(control: np.ndarray, traits: Traits, random: np.random.Generator, hair
 
 
 def _wear(cut, folder, control, head, look, random):
-    """The hair part, and how much of each head vertex [M] lies under it."""
+    """The hair part, and the share of each head vertex [M] that lies under it."""
     mesh = hairs.read_hair(folder, cut.name)
     fitted = hairs.fit_hair(mesh, control)
     fitted = fitted * [1, cut.volume, cut.volume] if cut.volume < 1 else fitted * cut.volume
@@ -115,8 +115,8 @@ def _wear(cut, folder, control, head, look, random):
         over_face = (points[:, 2] > 0.72) & (np.abs(points[:, 0]) < 0.78)
         keep &= ~over_face | (points[:, 1] > cut.fringe + 0.04 * np.sin(7 * points[:, 0]))
     points, across = points[keep], across[keep]
-    vertices, triangles, normals = hairs.hair_volume(points)
-    fine, coarse = hairs.strand_pattern(vertices, points, across, random)
+    vertices, triangles, normals = hairs.build_hair_volume(points)
+    fine, coarse = hairs.draw_strand_pattern(vertices, points, across, random)
     waves = skin.noise(vertices, random.uniform(0.25, 0.6), random)
     relief = STRAND_RELIEF * (0.7 * fine + coarse) + random.uniform(0.1, 0.7) * WAVE_RELIEF * waves
     vertices = vertices + np.clip(relief, -0.05, 0.05)[:, None] * normals

@@ -1,5 +1,5 @@
-"""What a textured head is made of: skin, hair, eyes and cloth told apart by place and colour, and the parts of a scene
-that follow."""
+"""Regions of a textured head: skin, hair, eyes and cloth, classified by position and colour, and the parts made of
+them."""
 
 from collections.abc import Sequence
 
@@ -19,13 +19,13 @@ from sira_mi.training.collection.textured_surface import Surface, place_index, s
 
 FACE_EDGE, HEAD_EDGE, BODY_EDGE = 0.03, 0.045, 0.07  # scene units, longest edge on the face, the head and below
 _LIP_MIDDLES = (13, 14, 82, 312)
-LIGHTNESS_WEIGHT = 0.6  # of L* beside a* and b* where colours are told apart
+LIGHTNESS_WEIGHT = 0.6  # of L* beside a* and b* in colour distances
 BALD = 12.0  # colour distance between crown and cheeks below which no hair is painted on the scalp
 SPECULAR = {skin.HAIR: 0.3, skin.CLOTH: 0.1, skin.EYE: 0.9}
 
 
-def head_edges(middle: np.ndarray) -> np.ndarray:
-    """Longest edge [E] at midpoints [E, 3] in the project's frame; there is no need to refine what no camera sees."""
+def choose_edge_lengths(middle: np.ndarray) -> np.ndarray:
+    """Longest edge [E] at midpoints [E, 3] in the project's frame; what no camera sees is not refined."""
     longest = np.where(middle[:, 1] > -1.3, np.where(middle[:, 2] > 0.3, FACE_EDGE, HEAD_EDGE), BODY_EDGE)
     outside = ((middle < np.array(DOMAIN_LOWER) - 0.3) | (middle > np.array(DOMAIN_UPPER) + 0.3)).any(1)
     return np.where(outside, np.inf, longest)
@@ -37,23 +37,24 @@ def face_mask(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     return (points[:, 2] > oval[:, 2].min() - 0.1) & points_in_poly(points[:, :2], oval[:, :2])
 
 
-def complete(landmarks: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Landmarks [468, 3] with the mean head's where there is none."""
+def fill_missing_landmarks(landmarks: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Landmarks [468, 3], those that are not valid replaced by the mean head's."""
     return np.where(valid[:, None], landmarks, mean_head()[0])
 
 
-def perceptual(albedo: np.ndarray) -> np.ndarray:
-    """CIE L*a*b* [N, 3] of linear colours, lightness reduced, so that shading baked into a texture counts less."""
+def convert_to_lab(albedo: np.ndarray) -> np.ndarray:
+    """CIE L*a*b* [N, 3] of linear colours, lightness reduced, so that shading baked into a texture has less weight."""
     return rgb2lab(linear_to_srgb(albedo)) * [LIGHTNESS_WEIGHT, 1, 1]
 
 
 def classify(vertices: np.ndarray, triangles: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
-    """Region code [N] of a textured head and body in the project's frame, from places and colours: hair is around the
-    face and nearer in colour to the crown than to the cheeks; cloth is below the chin and unlike the cheeks."""
-    colour = perceptual(albedo)
+    """Region code [N] of a textured head and body in the project's frame, from positions and colours: hair is around
+    the face and closer in colour to the crown than to the cheeks; cloth is below the chin and differs from the
+    cheeks."""
+    colour = convert_to_lab(albedo)
     face = face_mask(vertices, landmarks)
     chin = landmarks[CHIN, 1]
-    cheeks = np.median(colour[near_landmarks(vertices, landmarks, CHEEKS, 0.12)], axis=0)
+    cheeks = np.median(colour[find_near_landmarks(vertices, landmarks, CHEEKS, 0.12)], axis=0)
     above = vertices[:, 1] - np.where(np.abs(vertices[:, 0]) < 1.2, vertices[:, 1], -np.inf).max()
     crown = np.median(colour[(above > -0.3) & (np.abs(vertices[:, 0]) < 1.2)], axis=0)
     hairy = np.zeros(len(vertices), bool)
@@ -83,22 +84,24 @@ def classify(vertices: np.ndarray, triangles: np.ndarray, albedo: np.ndarray, la
     return np.array([skin.SKIN, skin.HAIR, skin.CLOTH])[places[index].argmax(1)]
 
 
-def near_landmarks(vertices: np.ndarray, landmarks: np.ndarray, chosen: Sequence[int], radius: float) -> np.ndarray:
+def find_near_landmarks(
+    vertices: np.ndarray, landmarks: np.ndarray, chosen: Sequence[int], radius: float
+) -> np.ndarray:
     """Indices of the vertices within a radius of the chosen landmarks, at least the nearest one of each."""
     tree = cKDTree(landmarks[list(chosen)])
     inside = np.flatnonzero(tree.query(vertices, distance_upper_bound=radius)[0] < radius)
     return np.union1d(inside, cKDTree(vertices).query(landmarks[list(chosen)])[1])
 
 
-def albedo_scale(vertices: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> float:
+def find_albedo_scale(vertices: np.ndarray, albedo: np.ndarray, landmarks: np.ndarray) -> float:
     """The factor that brings the cheeks' luminance into the range of measured skin; 1 inside it."""
     weights = np.array(LUMINANCE)
-    lightness = float(np.median(albedo[near_landmarks(vertices, landmarks, CHEEKS, 0.12)] @ weights))
+    lightness = float(np.median(albedo[find_near_landmarks(vertices, landmarks, CHEEKS, 0.12)] @ weights))
     low, high = float(skin.DARK_SKIN @ weights), float(skin.LIGHT_SKIN @ weights)
     return float(np.clip(lightness, low, high) / max(lightness, 1e-3))
 
 
-def specular_strength(vertices: np.ndarray, region: np.ndarray, landmarks: np.ndarray, base: float) -> np.ndarray:
+def paint_specular(vertices: np.ndarray, region: np.ndarray, landmarks: np.ndarray, base: float) -> np.ndarray:
     """Specular strength [N]: skin has `base`, more on lips, nose and forehead; hair, cloth and eyes have their own."""
     distance = cKDTree(landmarks[[*LIP_BORDER, *_LIP_MIDDLES]]).query(vertices)[0]
     lips = np.exp(-((distance / 0.06) ** 2))
@@ -117,7 +120,7 @@ def paint_part(surface: Surface, region: np.ndarray, landmarks: np.ndarray, scal
         surface.triangles,
         smooth_normals(surface.vertices, surface.triangles),
         np.clip(surface.colours() * scale, 0.004, 0.9),
-        specular_strength(surface.vertices, region, landmarks, base),
+        paint_specular(surface.vertices, region, landmarks, base),
         codes,
     )
 
@@ -134,6 +137,6 @@ def make_plain_part(surface: Surface, code: int = skin.SKIN) -> Part:
     )
 
 
-def skin_specular(seed: int) -> float:
+def draw_skin_specular(seed: int) -> float:
     """A person's base specular strength of skin (FLARE: 0.375 ± 0.166, of one person's parts less)."""
     return float(np.clip(np.random.default_rng([seed, 21]).normal(0.375, 0.09), 0.15, 0.65))

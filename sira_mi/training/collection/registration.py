@@ -1,4 +1,4 @@
-"""Non-rigid registration of a control mesh, seen through its refinement, to a triangle mesh.
+"""Non-rigid registration of a control mesh to a triangle mesh, by the control mesh's refined surface.
 
 The unknowns are the control vertices; every residual is a row on them: refined vertices to the nearest compatible
 target points, target points to the nearest refined surface points, and given pairs. The displacement from the template
@@ -103,7 +103,7 @@ def linear_step(rows: Rows, smooth: sparse.csc_matrix, stiffness: float) -> Solv
 
 @dataclass(frozen=True)
 class Problem:
-    """What is registered to what."""
+    """A control mesh, the target and the known correspondences."""
 
     template: np.ndarray  # [n, 3] control vertices, roughly aligned
     refine: sparse.csr_matrix  # [M, n] control vertices to vertices of the refined surface
@@ -113,7 +113,7 @@ class Problem:
     target: np.ndarray  # [V, 3] scene units
     target_triangles: np.ndarray  # [S, 3]
     pairs: Rows  # marks and curves that are known to belong together, weighed by `Level.pair_weight`
-    anchors: Rows  # what stays where it is, weighed alike at every level
+    anchors: Rows  # points that stay, with the same weight at every level
 
 
 def register(problem: Problem, levels: Sequence[Level]) -> tuple[np.ndarray, Solver]:

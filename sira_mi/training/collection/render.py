@@ -85,7 +85,7 @@ def camera_position(pose: np.ndarray) -> np.ndarray:
     return -pose[:3, :3].T @ pose[:3, 3]
 
 
-def mitsuba_mesh(name: str, part: Part) -> mi.Mesh:
+def make_mesh(name: str, part: Part) -> mi.Mesh:
     """A Mitsuba mesh of a part; diffuse and specular values are mesh attributes."""
 
     def disney(specular):
@@ -100,10 +100,10 @@ def mitsuba_mesh(name: str, part: Part) -> mi.Mesh:
         "full": disney(1.0),
     }
     props["bsdf"] = mi.load_dict({"type": "twosided", "inner": bsdf})
-    return mesh_of(name, part, props)
+    return build_mesh(name, part, props)
 
 
-def mesh_of(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
+def build_mesh(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
     """A Mitsuba mesh of a part's surface with the attributes `vertex_albedo` and `vertex_specular`; `props` holds its
     BSDF."""
     mesh = mi.Mesh(name, len(part.vertices), len(part.triangles), has_vertex_normals=True, props=props)
@@ -119,7 +119,7 @@ def mesh_of(name: str, part: Part, props: mi.Properties) -> mi.Mesh:
 
 def build_scene(parts: list[Part], light: np.ndarray, settings: RenderSettings) -> mi.Scene:
     """A Mitsuba scene of parts under a radiance map [H, 2H, 3]."""
-    scene: dict[str, Any] = {f"part{i}": mitsuba_mesh(f"part{i}", part) for i, part in enumerate(parts)}
+    scene: dict[str, Any] = {f"part{i}": make_mesh(f"part{i}", part) for i, part in enumerate(parts)}
     scene["light"] = {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32)), "mis_compensation": False}
     scene["integrator"] = {"type": "path", "max_depth": settings.depth, "hide_emitters": True}
     return mi.load_dict({"type": "scene", **scene})
@@ -208,7 +208,7 @@ def _columns(rows):
     return mi.Point3f(np.ascontiguousarray(rows.T.astype(np.float32)))
 
 
-def exposure(image: np.ndarray, weight: np.ndarray, target: float) -> float:
+def find_exposure(image: np.ndarray, weight: np.ndarray, target: float) -> float:
     """The factor that brings the weighted mean luminance of an image [H, W, 3] to `target`."""
     luminance = image @ np.array(LUMINANCE)
     return float(target * weight.sum() / max((luminance * weight).sum(), 1e-9))

@@ -24,7 +24,7 @@ from sira_mi.training.collection.render import (
     RenderSettings,
     build_scene,
     camera_position,
-    exposure,
+    find_exposure,
     is_blocked_along,
     is_blocked_towards,
     project,
@@ -66,7 +66,7 @@ class SceneSettings:
     render: RenderSettings = field(default_factory=RenderSettings)
 
 
-def visible_colors(scene, samples: Samples, cameras, images: np.ndarray, coverage: np.ndarray):
+def sample_visible_colors(scene, samples: Samples, cameras, images: np.ndarray, coverage: np.ndarray):
     """Visibility [P, V] and bilinear colours [P, V, 3]; pixels that the silhouette crosses are left out."""
     intrinsics, poses = cameras
     count, views = len(samples.points), len(poses)
@@ -116,11 +116,11 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
     wide = sample_parts(subject.parts, 4 * settings.points, nose, random)
     wide = wide.take(np.flatnonzero(is_seen_from_afar(scene, wide.points, wide.normals)))
     samples = choose_points(wide, nose, settings.points, settings.face_share, random)
-    target = random.uniform(*settings.render.frontal_luminance) * metering(samples)
-    scale = exposure(images[0], _head_weight(coverage[0], cameras), target)
+    target = random.uniform(*settings.render.frontal_luminance) * find_metering(samples)
+    scale = find_exposure(images[0], _head_weight(coverage[0], cameras), target)
     images = images * scale
     light_info["scale"] = scale
-    visible, colors = visible_colors(scene, samples, cameras, images, coverage)
+    visible, colors = sample_visible_colors(scene, samples, cameras, images, coverage)
 
     held_out = list(HELD_OUT_VIEWS)
     albedo_images, specular_images = render_albedo(scene, cameras[0][held_out], cameras[1][held_out], settings.render)
@@ -164,9 +164,9 @@ def make_scene(subject: Subject, seed: int, hdri: list[Path], settings: SceneSet
     }
 
 
-def metering(samples: Samples) -> float:
-    """Factor of a head's brightness in its photos: the square root of its albedo over a light skin's, half way between
-    a camera that evens out every head and one that exposes for the light."""
+def find_metering(samples: Samples) -> float:
+    """Factor of a head's brightness in its photos: the square root of its albedo over light skin's. A camera that
+    meters the head would give 1, one that meters the light the whole ratio."""
     head = samples.region != CLOTH
     return float(np.sqrt((samples.albedo[head] @ np.array(LUMINANCE)).mean() / 0.3))
 
@@ -181,7 +181,7 @@ def _head_weight(coverage, cameras):
 
 
 def _are_landmarks_uncovered(scene, landmarks):
-    """Landmarks that nothing hides from the front or from either side of the front."""
+    """Whether landmarks [468] are visible from the front or from either side."""
     origin = landmarks + np.array([0, 0, 0.06])
     seen = np.zeros(len(landmarks), bool)
     for direction in ([0.0, 0, 1], [0.5, 0, 0.866], [-0.5, 0, 0.866], [0.9, 0, 0.44], [-0.9, 0, 0.44]):

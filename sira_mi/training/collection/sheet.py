@@ -15,7 +15,7 @@ def encode_srgb(linear: np.ndarray) -> np.ndarray:
     return np.round(255 * linear_to_srgb(linear)).astype(np.uint8)
 
 
-def contact_sheet(folder: Path, count: int = 24, columns: int = 6, views: tuple[int, ...] = (0,)) -> np.ndarray:
+def make_contact_sheet(folder: Path, count: int = 24, columns: int = 6, views: tuple[int, ...] = (0,)) -> np.ndarray:
     """The chosen views of scenes spread over the folder as one 8-bit image; a scene's views lie below one another."""
     paths = sorted(folder.glob("*.npz"))
     paths = paths[:: max(1, len(paths) // count)][:count]
@@ -29,4 +29,4 @@ def contact_sheet(folder: Path, count: int = 24, columns: int = 6, views: tuple[
 
 def write_sheet(folder: Path, out: Path, **choices) -> None:
     """Writes the contact sheet of a collection as PNG."""
-    Image.fromarray(contact_sheet(folder, **choices)).save(out)
+    Image.fromarray(make_contact_sheet(folder, **choices)).save(out)

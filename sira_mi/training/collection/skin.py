@@ -211,7 +211,7 @@ def paint_eye(unit: np.ndarray, radius: float, look: Look) -> tuple[np.ndarray, 
     return albedo, np.full(len(unit), 0.9)
 
 
-def body_under(identity_vertices: np.ndarray, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dress_head(identity_vertices: np.ndarray, look: Look) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The dressed head: vertices [M, 3], triangles [T, 3] and the cloth mask [M]."""
     vertices, triangles = head_surface(identity_vertices)
     cloth = cloth_mask(look)

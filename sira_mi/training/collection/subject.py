@@ -1,4 +1,4 @@
-"""What every source of heads delivers: one person as closed surfaces with materials, landmarks and provenance."""
+"""The person that a source of heads delivers: closed surfaces with materials, landmarks and provenance."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,7 +17,7 @@ class Subject:
     landmarks: np.ndarray  # [468, 3] scene units
     landmarks_valid: np.ndarray  # [468] bool
     group: dict[str, str]  # "ancestry", "sex" and "age"; "unknown" where the source does not say
-    description: dict  # JSON types: everything drawn
+    description: dict  # JSON types: all random choices
     licence: str
 
 
@@ -26,7 +26,7 @@ class BrokenHead(ValueError):
 
 
 class Source(Protocol):
-    """Identities of one kind. Holds paths and numbers only, so that worker processes can take it over."""
+    """Identities of one kind. Holds only paths and numbers, so that it can be sent to worker processes."""
 
     @property
     def name(self) -> str:
@@ -43,4 +43,4 @@ class Source(Protocol):
         """Name of identity `number`, SOURCE/…, that its subject has."""
 
     def subject(self, number: int, seed: int) -> Subject:
-        """Identity `number`, its look drawn from `seed`. Raises `BrokenHead` when it cannot be used."""
+        """Identity `number` with a look drawn from `seed`. Raises `BrokenHead` when it cannot be used."""

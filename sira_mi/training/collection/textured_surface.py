@@ -135,8 +135,8 @@ def _split(triangles, middle, vertices):
 
 
 def close_borders(surface: Surface, lowest: float) -> Surface:
-    """The surface, in the project's frame, with its open borders closed. Borders that lie below the height `lowest` go
-    on down to `BODY_FLOOR`, those that look aside (as of arms) bent downwards; holes above are filled with shallow
+    """The surface, in the project's frame, with its open borders closed. Borders that lie below the height `lowest` are
+    extended down to `BODY_FLOOR`, sideways ones (as of arms) bent downwards; holes above are filled with shallow
     cones. Only holes of the largest connected piece are filled."""
     vertices, triangles = surface.vertices, surface.triangles
     index = place_index(vertices)
@@ -186,7 +186,7 @@ def close_borders(surface: Surface, lowest: float) -> Surface:
 
 
 def _drop(points, outward, bottom):
-    """Points of a border on the floor; the top of a border that looks aside lies farther out there."""
+    """Points of a border moved to the floor; the top of a sideways border is moved farther out."""
     aside = outward * [1, 0, 1]
     on_floor = points + (points[:, 1:2] - bottom) * aside
     on_floor[:, 1] = BODY_FLOOR

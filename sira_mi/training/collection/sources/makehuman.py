@@ -34,13 +34,13 @@ class MakeHumanSource:
             person.parts,
             landmarks,
             valid,
-            group_of(person),
+            find_group(person),
             person.description(),
             self.licence,
         )
 
 
-def group_of(person: Person) -> dict[str, str]:
+def find_group(person: Person) -> dict[str, str]:
     """Ancestry, sex and age band; "mixed" where no share is clear."""
     traits = person.traits
     ancestry = max(range(len(ANCESTRIES)), key=lambda k: traits.ancestry[k])

@@ -14,15 +14,15 @@ import trimesh
 from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import CHIN
 from sira_mi.portrait.load import srgb_to_linear
-from sira_mi.training.collection.annotation import axis_turns, find_face, place
+from sira_mi.training.collection.annotation import find_face, find_frame, list_axis_turns
 from sira_mi.training.collection.regions import (
-    albedo_scale,
+    choose_edge_lengths,
     classify,
-    complete,
-    head_edges,
+    draw_skin_specular,
+    fill_missing_landmarks,
+    find_albedo_scale,
     make_plain_part,
     paint_part,
-    skin_specular,
 )
 from sira_mi.training.collection.similarity import Similarity
 from sira_mi.training.collection.subject import BrokenHead, Subject
@@ -69,20 +69,20 @@ class MeshSource:
     def subject(self, number: int, seed: int) -> Subject:
         path = self.files()[number]
         surfaces = read_surfaces(path)
-        rough = find_face([make_plain_part(s) for s in _coarse(surfaces)], axis_turns())
-        surfaces = [refine(replace(s, vertices=rough(s.vertices)), head_edges) for s in surfaces]
+        rough = find_face([make_plain_part(s) for s in _refine_for_search(surfaces)], list_axis_turns())
+        surfaces = [refine(replace(s, vertices=rough(s.vertices)), choose_edge_lengths) for s in surfaces]
         still = Similarity(1.0, np.eye(3), np.zeros(3))
-        change, landmarks, valid, spread = place([make_plain_part(s) for s in surfaces], still, natural_size=False)
+        change, landmarks, valid, spread = find_frame([make_plain_part(s) for s in surfaces], still, natural_size=False)
         frame = change.after(rough)
-        marks = complete(landmarks, valid)
+        marks = fill_missing_landmarks(landmarks, valid)
         surfaces = [extend_to_floor(replace(s, vertices=change(s.vertices)), marks[CHIN, 1]) for s in surfaces]
-        surfaces = [refine(s, head_edges) for s in surfaces]
+        surfaces = [refine(s, choose_edge_lengths) for s in surfaces]
         everything = np.concatenate([s.vertices for s in surfaces])
         colours = np.concatenate([s.colours() for s in surfaces])
         offsets = np.cumsum([0] + [len(s.vertices) for s in surfaces])
         triangles = np.concatenate([s.triangles + o for s, o in zip(surfaces, offsets, strict=False)])
         region = classify(everything, triangles, colours, marks)
-        scale, base = albedo_scale(everything, colours, marks), skin_specular(seed)
+        scale, base = find_albedo_scale(everything, colours, marks), draw_skin_specular(seed)
         parts = [
             paint_part(s, region[start:end], marks, scale, base)
             for s, start, end in zip(surfaces, offsets, offsets[1:], strict=False)
@@ -114,7 +114,7 @@ def extend_to_floor(surface: Surface, chin: float) -> Surface:
     return closed
 
 
-def _coarse(surfaces):
+def _refine_for_search(surfaces):
     """Surfaces fine enough for their textures to show a face."""
     everything = np.concatenate([s.vertices for s in surfaces])
     span = float(np.ptp(everything, axis=0).max())
@@ -147,7 +147,7 @@ def read_surfaces(path: Path) -> list[Surface]:
     if float(max(np.ptp(piece.vertices, axis=0).max() for piece in pieces)) < 1e-12:
         raise BrokenHead("all vertices are in one place")
     linear = path.suffix.lower() in (".glb", ".gltf")
-    return [_outwards(_surface(piece, linear)) for piece in pieces]
+    return [_orient_outwards(_surface(piece, linear)) for piece in pieces]
 
 
 def _surface(piece, linear):
@@ -173,7 +173,7 @@ def _surface(piece, linear):
     return Surface(vertices, triangles, uv, np.asarray(albedo, float), texture)
 
 
-def _outwards(surface):
+def _orient_outwards(surface):
     """The surface with each connected piece turned so that it encloses a positive volume."""
     index = place_index(surface.vertices)
     ends = np.stack([surface.triangles, np.roll(surface.triangles, -1, axis=1)], axis=-1).reshape(-1, 2)

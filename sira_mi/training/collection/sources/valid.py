@@ -17,17 +17,17 @@ from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import CHIN
 from sira_mi.training.collection import hair as hairs
 from sira_mi.training.collection import skin
-from sira_mi.training.collection.annotation import mean_eyes, place
+from sira_mi.training.collection.annotation import find_frame, mean_eyes
 from sira_mi.training.collection.person import HAIR_SPECULAR, STRAND_RELIEF
 from sira_mi.training.collection.regions import (
-    albedo_scale,
+    choose_edge_lengths,
     classify,
-    complete,
+    draw_skin_specular,
     face_mask,
-    head_edges,
+    fill_missing_landmarks,
+    find_albedo_scale,
     make_plain_part,
     paint_part,
-    skin_specular,
 )
 from sira_mi.training.collection.render import Part
 from sira_mi.training.collection.similarity import Similarity
@@ -76,20 +76,20 @@ class ValidSource:
         rough = Similarity(UNITS_PER_METRE, np.eye(3), mean_eyes() - UNITS_PER_METRE * eyes)
         surfaces = {name: replace(s, vertices=rough(s.vertices)) for name, s in surfaces.items()}
         body = replace(surfaces[BODY], vertices=lower_arms(surfaces[BODY].vertices))
-        body = refine(close_borders(body, mean_eyes()[1] - 1.2), head_edges)
+        body = refine(close_borders(body, mean_eyes()[1] - 1.2), choose_edge_lengths)
         small = {n: refine(surfaces[n], lambda m: np.full(len(m), EYE_EDGE)) for n in EYES + GLANDS}
         parts = [
             make_plain_part(body),
             *(make_plain_part(small[n], skin.EYE if n in EYES else skin.SKIN) for n in small),
         ]
-        wig = wig_part(surfaces[WIG], random) if WIG in surfaces else None
+        wig = build_wig(surfaces[WIG], random) if WIG in surfaces else None
         still = Similarity(1.0, np.eye(3), np.zeros(3))
-        frame, landmarks, valid, spread = place([*parts, *([wig] if wig else [])], still, natural_size=True)
-        marks = complete(landmarks, valid)
+        frame, landmarks, valid, spread = find_frame([*parts, *([wig] if wig else [])], still, natural_size=True)
+        marks = fill_missing_landmarks(landmarks, valid)
 
         body = replace(body, vertices=frame(body.vertices))
         colours = body.colours()
-        scale, base = albedo_scale(body.vertices, colours, marks), skin_specular(seed)
+        scale, base = find_albedo_scale(body.vertices, colours, marks), draw_skin_specular(seed)
         region = classify(body.vertices, body.triangles, colours, marks)
         head = paint_part(body, region, marks, scale, base)
         others = frame.move(parts[1:])
@@ -109,11 +109,11 @@ class ValidSource:
             "landmark_spread_mm": float(np.nanmedian(spread)),
         }
         return Subject(
-            self.title(number), [head, *others], landmarks, valid, group_of(path.stem), description, self.licence
+            self.title(number), [head, *others], landmarks, valid, find_group(path.stem), description, self.licence
         )
 
 
-def group_of(stem: str) -> dict[str, str]:
+def find_group(stem: str) -> dict[str, str]:
     """Ancestry, sex and age by an avatar's name."""
     words = stem.removeprefix("X_").split("_")
     ancestry = words[0] if words[0] in ANCESTRIES else "unknown"
@@ -192,11 +192,11 @@ def lower_arms(vertices: np.ndarray) -> np.ndarray:
     return out
 
 
-def wig_part(wig: Surface, random: np.random.Generator) -> Part:
+def build_wig(wig: Surface, random: np.random.Generator) -> Part:
     """The closed volume around a wig's sheets, in the project's frame, with the sheets' colours."""
     points, uv = scatter(wig, hairs.SAMPLE_SPACING, random)
-    vertices, triangles, normals = hairs.hair_volume(points)
-    fine, coarse = hairs.strand_pattern(vertices, points, uv[:, 0], random)
+    vertices, triangles, normals = hairs.build_hair_volume(points)
+    fine, coarse = hairs.draw_strand_pattern(vertices, points, uv[:, 0], random)
     relief = STRAND_RELIEF * (0.7 * fine + coarse)
     vertices = vertices + np.clip(relief, -0.05, 0.05)[:, None] * normals
     near = cKDTree(points).query(vertices, k=3)[1]
