@@ -52,7 +52,7 @@ def plan_table(plan: Plan) -> str:
 def commands() -> list[str]:
     """Names of the project's commands, as `python -m sira_mi.NAME`."""
     folder = Path(sira_mi.__file__).parent
-    return [*sorted(file.parent.name for file in folder.glob("*/__main__.py")), "train"]
+    return sorted(".".join(file.parent.relative_to(folder).parts) for file in folder.rglob("__main__.py"))
 
 
 def relight_cases(subject: Subject, light: Light, matt: Subject) -> list[tuple[str, str, Subject, Light]]:
