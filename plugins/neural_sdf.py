@@ -7,7 +7,7 @@ import numpy as np
 from sira_mi.avatar.file import load_avatar
 from sira_mi.avatar.shape import POSE, SHAPE_PARAMETERS, HeadShape
 from sira_mi.fields import tracing
-from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, gather_columns, scatter_columns
+from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, gather_columns, scatter_columns, to_array
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
@@ -176,7 +176,7 @@ class NeuralSDF(mi.Mesh):
             f, gradient = evaluate_in_chunks(lambda p: surface(field, p)[:2], x)
             step = f * gradient / np.maximum((gradient**2).sum(axis=0), 1e-4)
             x = x - np.where(moved, np.clip(step, -0.5 * self.voxel, 0.5 * self.voxel), 0)
-        self._x0 = mi.TensorXf(np.ascontiguousarray(x, np.float32))
+        self._x0 = to_array(x)
         self._gradient = np.where(moved, gradient, 0)
         lengths = np.linalg.norm(gradient[:, moved], axis=0)
         self._gradient_length = max(float(np.median(lengths)), 1e-3) if moved.any() else 1.0

@@ -91,6 +91,10 @@ class SiraRadiance(mi.SamplingIntegrator):
         t, hit = trace_head(scene, head, ray, active)
         field = head.field()
 
+        # Mask: by the closest approach of every ray. It comes first: gradients are summed in this order, to the same bits.
+        closest = self._closest(head, field, local, active, width)
+        mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
+
         # Colour: eq. 4 at the hits, in tensors, one column a hit.
         color = dr.zeros(mi.Color3f, width)
         index = dr.compress(hit)
@@ -102,10 +106,6 @@ class SiraRadiance(mi.SamplingIntegrator):
             octaves = architecture.rendering_octaves
             radiance = render_radiance(network, octaves, x_ref, normalise(gradient), normalise(direction), gamma)
             color = scatter_columns(radiance, index, width, mi.Color3f)
-
-        # Mask: by the closest approach of every ray.
-        closest = self._closest(head, field, local, active, width)
-        mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
         return color, hit, [mask, closest]
 
     @staticmethod

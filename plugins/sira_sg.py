@@ -16,6 +16,7 @@ from sira_mi.fields.columns import (
     gather_columns,
     normalise,
     scatter_columns,
+    to_array,
     to_columns,
 )
 from sira_mi.fields.mlp import layers
@@ -286,7 +287,7 @@ class HeadShader:
     def _shade_mesh(self, ray, hits: Hits, index):
         """At the hits on the mesh of the rays `index`, with its normals; without gradients."""
         si = dr.gather(mi.SurfaceInteraction3f, hits.on_mesh, index)
-        to_local = mi.TensorXf(np.ascontiguousarray(rotation_of(self.head.to_world).T))
+        to_local = to_array(rotation_of(self.head.to_world).T)
         direction = gather_columns((self.head.to_local @ ray).d, index)
         x, normal = to_columns(self.head.to_local @ si.p), to_local @ to_columns(si.sh_frame.n)
         columns = [x, direction, normal, *mesh_albedos(self.head, self.bsdf, si, x)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from sira_mi.avatar.file import Avatar
 from sira_mi.avatar.shape import HeadShape, with_zero_latents
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, to_array
 from sira_mi.fields.sdf import SdfField, deform
 
 # Fixed-point steps that find a landmark's place from its place in reference space.
@@ -48,13 +48,13 @@ class LandmarkModel:
         self.linear = "landmark_directions" in tensors
         if self.linear:
             self.mean, self.placed = self._rows(tensors["landmarks"]), self._rows(tensors["landmark_placed"])
-            self.across = mi.TensorXf(np.ascontiguousarray(self._rows(tensors["landmark_directions"]).numpy().T))
+            self.across = to_array(self._rows(tensors["landmark_directions"]).numpy().T)
             self.offsets = self._rows(tensors["landmark_offsets"])
 
     def _rows(self, values: np.ndarray):
         """Tensor [..., 3 L] of [..., 468, 3], all x first."""
         values = np.moveaxis(values[..., self.known, :], -1, -2)
-        return mi.TensorXf(np.ascontiguousarray(values.reshape(-1, 3 * int(self.known.sum()))))
+        return to_array(values.reshape(-1, 3 * int(self.known.sum())))
 
     def __call__(self, placed):
         """Tensor [3, L] of tensor [3, L]."""

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import in_three
+from sira_mi.fields.columns import in_three, to_array
 from sira_mi.optimisation import losses
 
 # Deviation from the expected tone beyond which the loss grows linearly, standard deviations.
@@ -61,7 +61,7 @@ class SkinPrior:
         scenes = expected.shape[1]
         mean: mi.TensorXf = dr.sum(dr.reshape(albedo * in_three(weight), (3, scenes, -1)), axis=2)
         known: mi.TensorXf = dr.sum(dr.reshape(weight, (1, scenes, -1)), axis=2)
-        centre = mi.TensorXf(np.ascontiguousarray(expected, dtype=np.float32))
+        centre = to_array(expected)
         deviation = dr.log(mean + in_three(1.0 - known) * dr.exp(centre)) - centre
         along = mi.TensorXf(self._unit_axis()[None, :].astype(np.float32)) @ deviation
         along = dr.sum(along * along, axis=0)

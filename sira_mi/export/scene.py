@@ -6,6 +6,7 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.fields.columns import to_array
 from sira_mi.portrait.camera import Camera, yaw_rotation
 
 # OpenCV's camera looks along +z with x right and y down; Mitsuba's looks along +z with x left and y up.
@@ -63,7 +64,7 @@ def head(
 
 def sg_light(lobes: np.ndarray) -> dict:
     """The light of lobes [N_l, 7]."""
-    return {"type": "sg_envmap", "lobes": mi.TensorXf(np.ascontiguousarray(lobes, np.float32))}
+    return {"type": "sg_envmap", "lobes": to_array(lobes)}
 
 
 def head_scene(integrator: dict, sensor: dict, head: dict | mi.Object, light: dict) -> dict:

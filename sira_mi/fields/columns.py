@@ -81,7 +81,7 @@ def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
             piece = [np.asarray(a[:, start : start + CHUNK], dtype=np.float32) for a in arrays]
             count = piece[0].shape[1]
             piece = [np.pad(p, ((0, 0), (0, _padded_size(count) - count)), mode="edge") for p in piece]
-            result = function(*(mi.TensorXf(np.ascontiguousarray(p)) for p in piece))
+            result = function(*(to_array(p) for p in piece))
             result = result if isinstance(result, tuple) else (result,)
             dr.eval(*result)
             parts.append([r.numpy()[:, :count] for r in result])

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sira_mi.fields.columns import evaluate_in_chunks, from_columns, unit_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_array, unit_columns
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.sg.multisampling import COSINE
 from sira_mi.sg.radiance import Material, closed_form_radiance
@@ -119,18 +119,14 @@ def find_visible(shape: NeuralSDF, points: Surface, centre: np.ndarray) -> np.nd
     towards /= np.linalg.norm(towards, axis=0)
     facing = np.flatnonzero((towards * points.normal).sum(axis=0) > 0)
     start = points.point[:, facing] + offset * (points.normal[:, facing] + towards[:, facing])
-    columns = [mi.TensorXf(np.ascontiguousarray(v, np.float32)) for v in (start, towards[:, facing])]
+    columns = [to_array(v) for v in (start, towards[:, facing])]
     ray = mi.Ray3f(from_columns(columns[0], mi.Point3f), from_columns(columns[1], mi.Vector3f))
     return facing[~scene.ray_test(ray).numpy().astype(bool)]
 
 
-def _tensor(array):
-    return mi.TensorXf(np.ascontiguousarray(array, np.float32))
-
-
 def _radiance(points: Surface, view, roughness, k_s, lobes, visibility: Visibility | None = None) -> np.ndarray:
-    material = Material(_tensor(points.albedo), _tensor(points.specular), roughness, k_s)
-    radiance = closed_form_radiance(_tensor(points.normal), _tensor(view), material, _tensor(lobes), visibility)
+    material = Material(to_array(points.albedo), to_array(points.specular), roughness, k_s)
+    radiance = closed_form_radiance(to_array(points.normal), to_array(view), material, to_array(lobes), visibility)
     return radiance.diffuse.numpy() + radiance.specular.numpy()
 
 
@@ -188,9 +184,9 @@ def _view(points: Surface, centre: np.ndarray) -> np.ndarray:
 def _visibility(shape: NeuralSDF, points: Surface, view: np.ndarray, lobes: np.ndarray, roughness: float) -> Visibility:
     chosen = light_directions(lobes, DEFAULT_DIRECTIONS)
     unoccluded = trace_unoccluded(_scene(shape), points.point, points.normal, chosen.axis, SHADOW_OFFSET * shape.voxel)
-    normal, outgoing, specular = (_tensor(v) for v in (points.normal, view, points.specular))
+    normal, outgoing, specular = (to_array(v) for v in (points.normal, view, points.specular))
     return light_visibility(
-        normal, outgoing, specular, mi.Float(roughness), _tensor(lobes), chosen, _tensor(unoccluded)
+        normal, outgoing, specular, mi.Float(roughness), to_array(lobes), chosen, to_array(unoccluded)
     )
 
 

@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import in_three, to_columns
+from sira_mi.fields.columns import in_three, to_array, to_columns
 from sira_mi.fields.directions import GOLDEN_ANGLE, fibonacci_directions
 from sira_mi.sg import brdf
 from sira_mi.sg.arrays import Bool, Float, TensorXf
@@ -149,7 +149,7 @@ def light_radiance(lobes: TensorXf, directions: Directions) -> TensorXf:
         sharpness = wide
     ones = dr.full(mi.TensorXf, 1.0, (1, len(directions.axis)))
     axes: Float = dr.ravel(axis)
-    cosine = mi.TensorXf(axes, (count, 3)) @ _constant(directions.axis.T)
+    cosine = mi.TensorXf(axes, (count, 3)) @ to_array(directions.axis.T)
     exponent = (mi.TensorXf(sharpness, (count, 1)) @ ones) * dr.minimum(cosine - 1.0, 0.0)
     return (to_columns(amplitude) @ dr.exp(exponent)) * _in_rows(directions.weight, 3)
 
@@ -168,7 +168,7 @@ def light_visibility(
     of the directions nothing blocks the light.
 
     Differentiable in all but `unoccluded`; gradients have the same bits on every run."""
-    light, axis = light_radiance(lobes, directions), _constant(directions.axis)
+    light, axis = light_radiance(lobes, directions), to_array(directions.axis)
     cosine = axis @ normals
     light_cosine = dr.maximum(cosine, 0.0)
     diffuse, bounce_diffuse = _sums(light, directions, cosine, light_cosine, unoccluded)
@@ -202,14 +202,10 @@ def _sums(light, directions, cosine, weight, unoccluded):
     share = (light @ open_weight + floor) / (light @ weight + floor)
     moments = np.concatenate([0.25 * directions.weight[None], -0.5 * directions.weight * directions.axis.T])
     onto = np.concatenate([np.ones((1, len(directions.axis))), directions.axis.T])
-    incident = dr.maximum(_constant(onto.T) @ (_constant(moments) @ (weight - open_weight)), 0.0)
+    incident = dr.maximum(to_array(onto.T) @ (to_array(moments) @ (weight - open_weight)), 0.0)
     fading = dr.minimum(1.0 + cosine, 1.0)
     return share, (light @ (incident * fading)) * (1 / math.pi)
 
 
 def _in_rows(array, rows):
-    return _constant(np.repeat(array[None], rows, axis=0))
-
-
-def _constant(array):
-    return mi.TensorXf(np.ascontiguousarray(array, np.float32))
+    return to_array(np.repeat(array[None], rows, axis=0))

@@ -17,7 +17,7 @@ from sira_mi.avatar.decoders import SKIN_SPECULAR, diffuse_albedo, illumination,
 from sira_mi.avatar.shape import HeadShape
 from sira_mi.avatar.skin_tone import SkinPrior
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
+from sira_mi.fields.columns import evaluate_in_chunks, to_array, unit_columns
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.optimisation import losses
@@ -171,7 +171,7 @@ def draw_batch(scenes: list[FrozenScene], settings: AppearanceTraining, rng: np.
         parts["colors"].append(frozen.sample_color[:, samples])
     one_hot = np.zeros((len(scenes), len(chosen)), np.float32)
     one_hot[chosen, np.arange(len(chosen))] = 1
-    tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v, axis=1))) for k, v in parts.items()}
+    tensor = {k: to_array(np.concatenate(v, axis=1)) for k, v in parts.items()}
     level = np.array([scenes[k].skin_radiance for k in chosen])
     return AppearanceBatch(mi.TensorXf(one_hot), len(chosen), skin_radiance=level, **tensor)
 

@@ -12,7 +12,7 @@ from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.decoders import render_radiance
 from sira_mi.avatar.shape import SHAPE_LATENTS, SHAPE_NETWORKS, HeadShape
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import normalise
+from sira_mi.fields.columns import normalise, to_array
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, sphere_parameters, surface
 from sira_mi.optimisation import losses
@@ -111,7 +111,7 @@ def draw_batch(scenes: list[TrainingScene], settings: ShapeTraining, rng: np.ran
     on_surface = np.concatenate(parts["points"][::2])
     near = on_surface[rng.integers(len(on_surface), size=len(chosen) * settings.random_points)]
     parts["random_points"] = [near + _JITTER * rng.standard_normal(near.shape)]
-    tensor = {k: mi.TensorXf(np.ascontiguousarray(np.concatenate(v).T, dtype=np.float32)) for k, v in parts.items()}
+    tensor = {k: to_array(np.concatenate(v).T) for k, v in parts.items()}
     mixture = mi.TensorXf(gaussian_mixture(len(chosen), rng))
     return ShapeBatch(mi.TensorXf(one_hot), len(chosen), mixture=mixture, **tensor)
 

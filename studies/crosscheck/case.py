@@ -12,6 +12,7 @@ import numpy as np
 from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.export import scene as scenes
+from sira_mi.fields.columns import to_array
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.plugins.neural_sdf import NeuralSDF
 from sira_mi.plugins.sg_envmap import SGEnvmap
@@ -45,7 +46,7 @@ class Case:
     def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:
         """The head under `lobes` [N_l, 7], or under an emitter's description instead; seen through independent samples,
         or through `even` ones, spread over each pixel."""
-        light = light or {"type": "sg_envmap", "lobes": mi.TensorXf(np.ascontiguousarray(lobes, np.float32))}
+        light = light or {"type": "sg_envmap", "lobes": to_array(lobes)}
         others = {f"other_{k}": shape for k, shape in enumerate(self.others)}
         sensor = {**self.sensor, "sampler": {"type": "stratified" if even else "independent"}}
         return cast(mi.Scene, mi.load_dict({"type": "scene", "sensor": sensor, "head": head, "light": light, **others}))

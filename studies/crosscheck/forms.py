@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns
+from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_array, to_columns
 from sira_mi.plugins.neural_sdf import NeuralSDF
 from sira_mi.plugins.sira_sg import rotation_of, unoccluded_directions
 from sira_mi.sg import brdf, shading, visibility
@@ -38,13 +38,9 @@ def local_lobes(lobes: np.ndarray, head: NeuralSDF) -> np.ndarray:
     return turned
 
 
-def _tensor(array: np.ndarray) -> mi.TensorXf:
-    return mi.TensorXf(np.ascontiguousarray(array, np.float32))
-
-
 def closed_form(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np.ndarray:
     """Radiance [3, N] by this project's closed form, without visibility."""
-    light = _tensor(lobes)
+    light = to_array(lobes)
 
     def columns(normal, view, diffuse, specular):
         material = Material(diffuse, specular, roughness, mi.TensorXf(k_s, (1, 1)))
@@ -65,7 +61,7 @@ def with_visibility(
 ) -> np.ndarray:
     """Radiance [3, N] by the closed form with visibility, as `sira_sg` computes it; `bounce` adds the light off what
     blocks."""
-    light, directions = _tensor(lobes), visibility.light_directions(lobes, visibility.DEFAULT_DIRECTIONS)
+    light, directions = to_array(lobes), visibility.light_directions(lobes, visibility.DEFAULT_DIRECTIONS)
     factor = 1.0 if bounce else 0.0
 
     def columns(x, normal, view, diffuse, specular):
@@ -106,7 +102,7 @@ def _physg_cosine_integral(normal, axis, sharpness):
 
 def physg(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np.ndarray:
     """Radiance [3, N] by PhySG's closed form (Zhang et al. 2021), its two-term cosine included, negative light cut."""
-    light, rough = _tensor(lobes), mi.Float(roughness)
+    light, rough = to_array(lobes), mi.Float(roughness)
 
     def columns(normal, view, diffuse, specular):
         n, v, s = from_columns(normal, mi.Vector3f), from_columns(view, mi.Vector3f), from_columns(specular, mi.Float)
@@ -173,7 +169,7 @@ def direct_light(
 
     `samples` directions each are drawn from the light, the cosine and the normal distribution (balance heuristic); even
     sequences, shifted at random for every ray of the picture."""
-    mixture: Array = LobeMixture(_tensor(lobes))
+    mixture: Array = LobeMixture(to_array(lobes))
     directions: tuple[Array, ...] = tuple(mi.Vector3f(_rows(a)) for a in (points.normal, points.facing, points.view))
     normal, facing, view = directions
     x, count = mi.Point3f(_rows(points.x)), points.x.shape[1]

@@ -4,13 +4,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.file import LANDMARK_MODEL, Avatar
 from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.fields.columns import to_array
 from sira_mi.training.landmark_regression import landmark_tensors
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
@@ -58,7 +58,7 @@ def measure_held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]
         others = Places(found.placed[fold != k], found.true[fold != k])
         model = LandmarkModel(add_landmark_model(prior, others))
         for head in np.flatnonzero(fold == k):
-            placed = mi.TensorXf(np.ascontiguousarray(found.placed[head, known].T))
+            placed = to_array(found.placed[head, known].T)
             modelled[head, known] = model(placed).numpy().T
     before, after = (np.linalg.norm(landmarks - found.true, axis=2) for landmarks in (found.placed, modelled))
     return float(np.nanmean(before)) * MILLIMETRES_PER_UNIT, float(np.nanmean(after)) * MILLIMETRES_PER_UNIT

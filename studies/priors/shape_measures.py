@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from sira_mi.avatar.decoders import render_radiance
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
+from sira_mi.fields.columns import evaluate_in_chunks, to_array, unit_columns
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface
 from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
 from sira_mi.optimisation import losses
@@ -134,9 +134,9 @@ def fit_shape(
         w = optimizer["w"]
         dr.enable_grad(w)
         field = model.field(_latents(model, "z_sdf", w))
-        f, gradient, _, _ = surface(field, mi.TensorXf(np.ascontiguousarray(points.T)))
+        f, gradient, _, _ = surface(field, to_array(points.T))
         loss = losses.surface_loss(f) + fit.penalty * losses.mean(w * w)
-        loss += fit.normal * losses.normal_loss(gradient, mi.TensorXf(np.ascontiguousarray(normals.T)))
+        loss += fit.normal * losses.normal_loss(gradient, to_array(normals.T))
         dr.backward(loss)
         optimizer.step()
     return dr.detach(optimizer["w"]).numpy()
@@ -159,7 +159,7 @@ def color_errors(
     arrays = [np.stack(column, axis=1) for column in zip(*inputs, strict=True)]  # [rows, S, 4096]
 
     def radiance(w_r, index):
-        parts = [mi.TensorXf(np.ascontiguousarray(a[:, :, index].reshape(len(a), -1), np.float32)) for a in arrays]
+        parts = [to_array(a[:, :, index].reshape(len(a), -1)) for a in arrays]
         rendering = model.layers_at("rendering", _latents(model, "z_r", w_r))
         return render_radiance(rendering, model.architecture.rendering_octaves, *parts[:4]), parts[4]
 

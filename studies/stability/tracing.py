@@ -19,6 +19,7 @@ import numpy as np
 from sira_mi.avatar.file import load_avatar, save_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, MILLIMETRES_PER_UNIT
 from sira_mi.fields import tracing
+from sira_mi.fields.columns import to_array
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.mlp import SOFTPLUS_SHARPNESS
 from sira_mi.fields.sdf import SdfField
@@ -172,7 +173,7 @@ def _are_hit_gradients_finite(head, origin, direction, t) -> bool:
     for key in keys:
         head.parameters[key] = mi.Float(before[key])
         dr.enable_grad(head.parameters[key])
-    columns = [mi.TensorXf(np.ascontiguousarray(a, np.float32)) for a in (origin, direction, t[None])]
+    columns = [to_array(a) for a in (origin, direction, t[None])]
     dr.backward(dr.sum(tracing.differentiable_hit(head.field(), *columns), axis=None))
     finite = all(count_non_finite(dr.grad(head.parameters[key]).numpy()) == 0 for key in keys)
     head.parameters |= before
@@ -298,7 +299,7 @@ def _measure_hand_made(name: str, field: SdfField, origin, direction, start, fou
     o, d = (c.astype(np.float64)[:, hit] for c in columns[:2])
     errors = measure_hit_errors(reference, o, d, t[0, hit].astype(np.float64))
     dr.enable_grad(field.reference[0][0], field.reference[1][0])
-    hits = [mi.TensorXf(np.ascontiguousarray(c[:, hit])) for c in (*columns[:2], t)]
+    hits = [to_array(c[:, hit]) for c in (*columns[:2], t)]
     dr.backward(dr.sum(tracing.differentiable_hit(field, *hits), axis=None))
     finite = all(count_non_finite(dr.grad(layer[0]).numpy()) == 0 for layer in field.reference)
     share = float(hit.mean())
