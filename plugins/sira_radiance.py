@@ -91,7 +91,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         t, hit = trace_head(scene, head, ray, active)
         field = head.field()
 
-        # Mask: by the closest approach of every ray. It comes first: gradients are summed in this order, to the same bits.
+        # Mask: by the closest approach of every ray. Before the colour: the order decides the last bits of gradients.
         closest = self._closest(head, field, local, active, width)
         mask = dr.rcp(1.0 + dr.exp(dr.clip(self.mask_sharpness * closest, -60.0, 60.0)))
 

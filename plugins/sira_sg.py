@@ -182,7 +182,7 @@ class SiraSG(mi.SamplingIntegrator):
             return lobes
         if not (len(chosen) and ((chosen >= 0) & (chosen < count)).all()):
             raise InputError(f"sira_sg: shaded_lobes must be numbers of lobes, 0 to {count - 1}, and at least one")
-        return mi.TensorXf(np.ascontiguousarray(lobes.numpy()[chosen]))
+        return to_array(lobes.numpy()[chosen])
 
     def aov_names(self):
         return extra_channel_names() if self.aovs else []
