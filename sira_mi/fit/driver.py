@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import numpy as np
 from tqdm import tqdm
 
@@ -20,10 +19,12 @@ from sira_mi.fit.stage import Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation.adam import (
     adam,
+    cosine_fall,
     optimizer_state,
     parameter_values,
     read_arrays,
     restore_optimizer,
+    take_step,
     write_arrays,
 )
 
@@ -215,13 +216,11 @@ def _step(
     """One step with `factor` times the stage's learning rates; the loss terms before it."""
     rates = {name: factor * rate * _fall(step / stage.steps) for name, rate in stage.rates.items()}
     optimizer.set_learning_rate(rates)
-    dr.enable_grad(*(optimizer[name] for name in optimizer))
-    terms = problem.losses(dict(optimizer.items()), step, rng)
-    dr.backward(sum(terms.values()))
-    optimizer.step()
-    return {name: float(value.numpy().item()) for name, value in terms.items()}
+    return take_step(
+        optimizer, lambda parameters: problem.losses(parameters, step, rng), lambda terms: sum(terms.values())
+    )
 
 
 def _fall(share: float) -> float:
     """Learning rates fall to a fifth over a stage along a cosine, after a warm-up over its first twentieth."""
-    return min(1.0, 0.1 + share * 18) * (0.2 + 0.8 * 0.5 * (1 + math.cos(math.pi * share)))
+    return min(1.0, 0.1 + share * 18) * cosine_fall(share, 0.2)
