@@ -1,1 +1,1 @@
-"""What a picture or a fit may leave out, decided from the scene beforehand, with a bound on the error of each."""
+"""What pictures and fits leave out, measured (`python -m studies.leave_out`)."""
