@@ -1,5 +1,5 @@
-"""The cross-validation: its arithmetic on made-up numbers, its estimators against each other and against `sira_sg`, a
-tiny run end to end, and what it says about bad input."""
+"""The cross-check: its arithmetic on made-up numbers, its estimators against each other and against `sira_sg`, a
+tiny run end to end, and its errors for bad input."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 

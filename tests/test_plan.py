@@ -415,7 +415,8 @@ for name in {commands}:
     assert not loaded, (name, loaded)
 print("fine")
 """
-    assert {f"sira_mi.{name}" for name in ("crosscheck", "fit", "relight", "training")} <= set(commands) and run(
+    expected = {f"sira_mi.{name}" for name in ("crosscheck", "fit", "relight", "training")}
+    assert expected <= set(commands) and run(code).strip() == "fine"
         code
     ).strip() == "fine"
 

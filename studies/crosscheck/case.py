@@ -1,4 +1,4 @@
-"""What is cross-validated: a head, what stands around it, and the sensor that sees it."""
+"""The scene of a cross-check: a head, the shapes around it, and a sensor."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class Case:
     lobes: np.ndarray | None = None  # [N_l, 7] of the scene's own light, in world coordinates
 
     def head(self, voxel: float, baked: bool = True) -> NeuralSDF:
-        """The head as a shape whose mesh has the spacing `voxel` (scene units), its albedos kept at the vertices or
-        evaluated as networks at every hit."""
+        """The head as a shape whose mesh has the spacing `voxel`, scene units. Albedos are `baked` at the vertices, or
+        evaluated by the networks at every hit."""
         description = scenes.head(self.avatar, voxel, baked, to_world=mi.ScalarTransform4f(self.to_world))
         bsdf = description["bsdf"]
         bsdf["roughness"], bsdf["k_s"] = self.roughness, self.k_s
         return cast(NeuralSDF, mi.load_dict(description))
 
     def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:
-        """The head under `lobes` [N_l, 7], or under an emitter's description instead; seen through independent samples,
-        or through `even` ones, spread over each pixel."""
+        """The head under `lobes` [N_l, 7], or under the emitter that `light` describes. The sampler is independent, or
+        stratified with `even`."""
         light = light or {"type": "sg_envmap", "lobes": to_array(lobes)}
         others = {f"other_{k}": shape for k, shape in enumerate(self.others)}
         sensor = {**self.sensor, "sampler": {"type": "stratified" if even else "independent"}}
@@ -78,14 +78,14 @@ def _case_of_scene(path: Path, size: int) -> Case:
         raise InputError(f"{path}: Mitsuba cannot load it: {str(error).splitlines()[-1].strip()}") from error
     heads = [shape for shape in scene.shapes() if isinstance(shape, NeuralSDF)]
     if len(heads) != 1:
-        raise InputError(f"{path} holds {len(heads)} neural_sdf; the cross-validation needs exactly one")
+        raise InputError(f"{path} holds {len(heads)} neural_sdf; a cross-check needs exactly one")
     head, bsdf, light = heads[0], heads[0].bsdf(), scene.environment()
     if not isinstance(bsdf, SiraBSDF):
-        raise InputError(f"{path}: the material of the neural_sdf is not a sira_bsdf, which both sides are to have")
+        raise InputError(f"{path}: the material of the neural_sdf is not a sira_bsdf, which both sides need")
     if not all(isinstance(texture, NeuralAlbedo) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo)):
         raise InputError(f"{path}: both albedos of the sira_bsdf must be neural_albedo textures")
     if not isinstance(light, SGEnvmap) or len(scene.emitters()) != 1:
-        raise InputError(f"{path}: the light must be one sg_envmap and nothing else; closed forms know no other")
+        raise InputError(f"{path}: the light must be one sg_envmap and nothing else; closed forms need that")
     if not scene.sensors():
         raise InputError(f"{path} holds no sensor; add a perspective one")
     sensor, width, height = _sensor(path, scene.sensors()[0], size)

@@ -1,4 +1,4 @@
-"""Why the closed forms differ from the reference: pictures that differ by one thing each."""
+"""The causes of the difference between closed forms and path tracing: pairs of pictures that differ by one thing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Row:
 
 
 def gather(case: Case, reference: NeuralSDF, usual: NeuralSDF, side: int, seed: int) -> list[Half]:
-    """Both halves, side² rays a pixel each. They serve every light."""
+    """Both halves, side² rays a pixel each. They are the same for every light."""
     halves = []
     for half in range(2):
         black = np.array([[0, 0, 1, 1, 0, 0, 0]], np.float32)
@@ -84,7 +84,7 @@ class Pictures:
 def shade_halves(
     case: Case, reference: NeuralSDF, usual: NeuralSDF, halves: list[Half], lobes: np.ndarray, samples: int, seed: int
 ) -> Pictures:
-    """Every form at the points of both halves under `lobes` [N_l, 7]; `samples` of each kind for direct light."""
+    """All pictures of both halves under `lobes` [N_l, 7], with `samples` directions of each kind for direct light."""
     scene, other = case.scene(reference, lobes), case.scene(usual, lobes)
     local, roughness, k_s = forms.local_lobes(lobes, reference), case.roughness, case.k_s
     shaded = []
@@ -128,8 +128,8 @@ def masks(halves: list[Half], pictures: Pictures) -> dict[str, np.ndarray]:
 
 
 def parts(pictures: Pictures, reference: Estimate, interreflection: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-    """For each form the causes [2, H, W, 3] that lead from it to the reference, one after the other; their sum is
-    `TOTAL`, by the last of them, `REST`, which is noise unless a cause was overlooked."""
+    """For each form the causes [2, H, W, 3] that lead from it to the reference. They add up to `TOTAL`; the last of
+    them, `REST`, is noise unless a cause was overlooked."""
     p, traced = pictures, reference.halves
     geometry = {PROXY: p.mesh - p.arriving, BAKED: p.baked - p.mesh}
     lit = {VISIBILITY: p.arriving - p.open, **geometry, INTERREFLECTION: interreflection}
@@ -151,7 +151,7 @@ def parts(pictures: Pictures, reference: Estimate, interreflection: np.ndarray) 
 def rows(
     light: str, form: str, named: Mapping[str, np.ndarray], regions: Mapping[str, np.ndarray], level: float
 ) -> list[Row]:
-    """The table of one form: a `Row` for each of the pictures [2, H, W, 3] in `named`, of which one is `TOTAL`."""
+    """A `Row` for each of the pictures [2, H, W, 3] in `named`, one of which is `TOTAL`."""
     total, head = named[TOTAL], regions[HEAD]
     square = mean_square(total[0], total[1], head)
     result = []
@@ -168,7 +168,7 @@ def rows(
 
 
 def noise_row(light: str, reference: Estimate, regions: Mapping[str, np.ndarray], level: float) -> Row:
-    """What noise is left in the mean of the reference's halves, by region."""
+    """The noise of the mean of the reference's halves, by region."""
     half = 0.5 * (reference.halves[0] - reference.halves[1])
     errors = {
         region: float(np.sqrt((half[regions[region]] ** 2).mean())) / level if regions[region].any() else None
@@ -178,7 +178,7 @@ def noise_row(light: str, reference: Estimate, regions: Mapping[str, np.ndarray]
 
 
 def usual_row(light: str, pictures: Pictures, regions: Mapping[str, np.ndarray], level: float, voxel: float) -> Row:
-    """Beside the sums: what the mesh of the plugin's usual spacing would add to direct light, against the field."""
+    """Beside the sum: the error of direct light on a mesh of the plugin's default spacing, against the field."""
     part = pictures.usual - pictures.arriving
     name = f"beside the sum: a mesh of {voxel:g} instead of the field"
     row = rows(light, "", {name: part, TOTAL: part}, regions, level)[0]

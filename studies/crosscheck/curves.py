@@ -1,4 +1,4 @@
-"""Error against run time: every form with more and more samples, and what the path tracer converges to."""
+"""Error against time: every method with more and more samples, and the limits of path tracing."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ SHARED_MESH = "c: with visibility, shared, on the mesh, baked"
 DIRECT, BOUNCE, PATH = "d: direct light, Monte Carlo", "e: path, one bounce", "e: path, all bounces"
 # Depths of Mitsuba's path tracer.
 DEPTHS = {DIRECT: 2, BOUNCE: 3, PATH: -1}
-# Samples a pixel of closed forms, the square roots: of those that shade every sample, and of those that share shadings.
+# Square roots of the samples a pixel of closed forms: those that shade every sample, and those that share shadings.
 _SIDES, _SHARED_SIDES = (1, 2, 3), (2, 3, 4, 6)
 _TRACED_SAMPLES = (1, 4, 16, 64, 256, 1024, 4096)
 _REPEATS = 3
-# Of closed forms, which take turns with two sets of rays.
+# Runs of closed forms, which alternate between two sets of rays.
 _TURNS = 2
-# From this many samples a pixel on, the time of a launch is that of its samples.
+# From this many samples a pixel on, the time of a launch grows with its samples.
 _FIRST_FITTED = 16
 
 
@@ -55,7 +55,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Limit:
-    """Where a depth of the path tracer converges to, against the reference."""
+    """The difference between the limit of path tracing to some depth and the reference."""
 
     light: str
     method: str
@@ -72,10 +72,10 @@ class Slope:
     over_samples: float
 
 
-def timed(function: Callable[[int], np.ndarray], repeats: int, warm: bool) -> tuple[np.ndarray, float]:
-    """The last result and the median wall time of `repeats` runs of `function(k)`, k in turns 0 and 1; `warm` makes one
-    of each before. The turns keep `neural_sdf` from answering with the hits of the run before, and two numbers of hits
-    have all their kernels compiled after two runs."""
+def time_runs(function: Callable[[int], np.ndarray], repeats: int, warm: bool) -> tuple[np.ndarray, float]:
+    """The last result and the median wall time of `repeats` runs of `function(k)` with k alternating between 0 and 1;
+    `warm` runs each once before. Alternating keeps `neural_sdf` from reusing the hits of the last run, and kernels of
+    two numbers of hits are compiled after two runs."""
     if warm:
         function(0)
         function(1)
@@ -129,7 +129,7 @@ def measure_curves(
         points.append(Point(light, method, samples, spent, error, flip(image, reference.mean, mask)))
 
     for method, samples, function in _closed_forms(case, head, lobes, seed, log):
-        add(method, samples, *timed(function, _TURNS, warm=True))
+        add(method, samples, *time_runs(function, _TURNS, warm=True))
     left = max(seconds - (time.monotonic() - start), 0.4 * seconds)
     for method, depth in DEPTHS.items():
         integrator, halves, spent = path(depth), [], 0.0
@@ -145,7 +145,7 @@ def measure_curves(
                 return render(scene, integrator, samples, seed, 3, samples, k, log=log)
 
             few = samples <= 16
-            image, spent = timed(run, _REPEATS if few else 1, warm=few)
+            image, spent = time_runs(run, _REPEATS if few else 1, warm=few)
             halves = [image]
             add(method, samples, image, spent)
         halves.append(render(scene, integrator, points[-1].samples, seed, 3, points[-1].samples, _REPEATS + 1, log=log))
@@ -154,7 +154,7 @@ def measure_curves(
 
 
 def limit(light: str, method: str, halves: list[np.ndarray], reference: Estimate, mask: np.ndarray) -> Limit:
-    """How far two independent pictures of a method are from the reference when their noise is taken out."""
+    """How far the limit of a method is from the reference, by two independent pictures of it, without their noise."""
     first, second = (halves[k] - reference.halves[k] for k in range(2))
     level = max(float(reference.mean[mask].mean()), 1e-12)
     error = root(mean_square(first, second, mask))
@@ -178,8 +178,8 @@ def slopes(points: list[Point]) -> list[Slope]:
 
 
 def time_of_path(points: list[Point], light: str, error: float) -> float:
-    """Wall time that the path tracer needs for `error` under a light: its curve, straight on both logarithmic axes and
-    of slope −½ beyond its ends."""
+    """Wall time that path tracing takes to `error` under a light, by a line of slope −½ through its points on
+    logarithmic axes; NaN without points."""
     used = [p for p in points if (p.light, p.method) == (light, PATH) and p.samples >= _FIRST_FITTED]
     if not used:
         return float("nan")

@@ -1,5 +1,5 @@
-"""Every way to shade the same points: PhySG's closed form, this project's with and without visibility and in float64,
-and direct light by Monte Carlo, with shadows and without."""
+"""The ways to shade one set of points: PhySG's closed form, this project's with and without visibility and in float64,
+and direct light by Monte Carlo with and without shadows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DOUBLE_CHUNK = 1 << 15
 
 
 def local_lobes(lobes: np.ndarray, head: NeuralSDF) -> np.ndarray:
-    """Lobes [N_l, 7] in world coordinates as the head's field sees them."""
+    """Lobes [N_l, 7] from world coordinates to those of the head's field."""
     turned = np.array(lobes, np.float32)
     turned[:, :3] = turned[:, :3] @ rotation_of(head.to_world)
     return turned
@@ -59,8 +59,8 @@ def with_visibility(
     k_s: float,
     bounce: bool = True,
 ) -> np.ndarray:
-    """Radiance [3, N] by the closed form with visibility, as `sira_sg` computes it; `bounce` adds the light off what
-    blocks."""
+    """Radiance [3, N] by the closed form with visibility, as `sira_sg` computes it; `bounce` adds light that occluders
+    reflect."""
     light, directions = to_array(lobes), visibility.light_directions(lobes, visibility.DEFAULT_DIRECTIONS)
     factor = 1.0 if bounce else 0.0
 
@@ -151,7 +151,7 @@ def closed_form_double(
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """Direct light at some points apart from their albedos: irradiance and, for F = 1 and F = P, specular radiance."""
+    """Direct light at some points without their albedos: irradiance, and specular radiance with F = 1 and F = P."""
 
     irradiance: np.ndarray  # [3, N]
     white: np.ndarray  # [3, N]
@@ -183,7 +183,7 @@ def direct_light(
     rough: Array = mi.Float(roughness)
 
     def weigh(direction):
-        """What a direction adds: irradiance, white and grazing specular radiance, before its density."""
+        """The contribution of a direction: whether it counts, its weight, and the two factors of specular radiance."""
         cos_light = dr.dot(normal, direction)
         above = visible & (cos_light > 0.0)
         radiance, density = mixture.evaluate(direction)

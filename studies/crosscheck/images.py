@@ -1,5 +1,5 @@
-"""Path-traced pictures: passes of independent seeds, references whose end is decided by their measured variance, and
-the distances between pictures of which each is known as two independent halves."""
+"""Path-traced pictures in passes of independent seeds, references that end when their variance is small enough, and
+differences between pictures that are known as two independent halves."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sira_mi.portrait.load import linear_to_srgb
 
 # Rays of one launch.
 _LAUNCH = 1 << 21
-# Times that a launch with values that are not finite is made again with another seed.
+# Tries of a launch, with other seeds, while it has values that are not finite.
 _MOST_TRIES = 5
-# Passes before the variance among them is believed.
+# Passes before the variance among them is used.
 _MINIMUM_PASSES = 8
 
 

@@ -1,4 +1,4 @@
-"""The light settings of the cross-validation: lobes as in a `lights.json`."""
+"""The lights of the cross-check: lobes as in a `lights.json`."""
 
 import numpy as np
 
@@ -28,9 +28,9 @@ SETTINGS = {
         (-0.3, 0.8, 0.5, 8.0, 0.3, 0.5, 0.5),
     ),
 }
-# The setting that the marks of error and speed are about.
+# The light of the marks of error and speed.
 SOFT = "soft studio"
-# Of a scene file's own light.
+# The name of a scene file's own light.
 OWN = "the scene's own"
 
 

@@ -1,5 +1,5 @@
-"""The surface points that a picture's rays see, on the field or on its mesh, with all that shading needs: closed forms
-and direct light are then evaluated at the same points, and differ by nothing else."""
+"""The surface points of a picture, on the field or on its mesh, with everything that shading needs. Closed forms and
+direct light are evaluated at the same points, so that they differ by nothing else."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Points:
         return np.stack(sums, axis=-1).reshape(height, width, -1) / self.samples
 
     def baked(self) -> tuple[np.ndarray, np.ndarray]:
-        """Both albedos as the mesh keeps them."""
+        """Diffuse and specular albedo by interpolation between vertices."""
         if self.baked_diffuse is None or self.baked_specular is None:
             raise ValueError("points on the field have no baked albedos")
         return self.baked_diffuse, self.baked_specular

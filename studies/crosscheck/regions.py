@@ -1,9 +1,9 @@
-"""The regions of a head that errors are told for; every pixel of the head lies in exactly one."""
+"""Regions of a head by which errors are reported; every pixel of the head lies in exactly one."""
 
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-# In the order in which they take their pixels.
+# A pixel belongs to the first of these that fits.
 SILHOUETTE, SHADOW, GRAZING, LIT = "silhouette", "shadow", "grazing", "lit"
 REGIONS = (LIT, GRAZING, SHADOW, SILHOUETTE)
 HEAD = "head"
@@ -14,8 +14,8 @@ GRAZING_COSINE = 0.5
 def regions(coverage: np.ndarray, cosine: np.ndarray, share: np.ndarray) -> dict[str, np.ndarray]:
     """Masks [H, W] by region, and `head`, all of them together.
 
-    From the share of a pixel that the head covers, the mean cosine of normal and view, and the share of the direct
-    light that arrives past what blocks it, all [H, W]. Beyond the picture the head is taken to go on."""
+    `coverage` is the share of a pixel that the head covers, `cosine` the mean cosine of normal and view, `share` the
+    unoccluded share of direct light, all [H, W]. The head is assumed to continue beyond the picture."""
     head = coverage > 0
     silhouette = head & (minimum_filter(coverage, size=3, mode="nearest") < 0.999)
     shadow = head & ~silhouette & (share < SHADOW_SHARE)

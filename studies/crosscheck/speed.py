@@ -1,4 +1,4 @@
-"""Times of the plugins as ratios within one run: medians over repeats that take turns, kernels compiled before."""
+"""Times of the plugins as ratios: medians over runs in turn, with compiled kernels."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Cost:
-    """Time of something that grows."""
+    """Time of one size of a problem."""
 
     what: str
     lobes: int
@@ -65,8 +65,8 @@ class Cost:
 
 
 def interleave(functions: dict[str, Callable[[], object]], repeats: int = _REPEATS) -> dict[str, float]:
-    """Median wall time of each function, after one run of each; they take turns, so that other work on the machine
-    meets all alike."""
+    """Median wall time of each function, after one run of each. They run in turn, so that other work on the machine
+    affects all alike."""
     spent: dict[str, list[float]] = {name: [] for name in functions}
     for k in range(repeats + 1):
         for name, function in functions.items():
@@ -131,8 +131,8 @@ def texture_ratios(case: Case, usual: NeuralSDF, lobes: np.ndarray, samples: int
     runs["baked, envmap"] = case.scene(usual, lobes, _environment(lobes))
     runs["attribute principled, envmap"] = case.scene(shapes["attribute principled"], lobes, _environment(lobes))
     seconds = interleave({k: functools.partial(render, s, integrator, samples, 5) for k, s in runs.items()})
-    # Networks take long: few samples have to do. Stock Mitsuba's turn is before there is a head with networks, because
-    # the kernels of every picture hold those of all heads that are alive.
+    # Networks are slow, so these pictures have few samples. Stock Mitsuba comes before there is a head with networks,
+    # because all kernels hold the networks of every head that is alive.
     few: dict[str, float] = {}
     for name, shape in (
         ("stock", lambda: shapes["bitmap principled"]),
