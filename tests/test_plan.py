@@ -417,8 +417,6 @@ print("fine")
 """
     expected = {f"sira_mi.{name}" for name in ("crosscheck", "fit", "relight", "training")}
     assert expected <= set(commands) and run(code).strip() == "fine"
-        code
-    ).strip() == "fine"
 
 
 def test_the_page_in_docs_is_that_of_its_figures():
