@@ -198,7 +198,7 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
     """AD through placing, landmark model, pose and camera against central differences."""
     from conftest import camera, slopes
 
-    from sira_mi.fit.geometry import GeometryProblem, GeometryScene
+    from sira_mi.fit.geometry import GeometryProblem, GeometryScene, GeometryStage
     from sira_mi.fit.settings import QUALITIES
     from sira_mi.fit.state import initial_state
     from sira_mi.portrait.portrait import Portrait
@@ -212,7 +212,9 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
     grey, whole = np.full((64, 64, 3), 0.2, np.float32), np.ones((64, 64), np.float32)
     settings = QUALITIES["draft"]
     scene = GeometryScene(Portrait(grey, whole, pixels, pixels, view, ()), learned, path, settings, exposure=1.0)
-    problem = GeometryProblem(settings.stages[0], scene)
+    stage, found = settings.stages[0], scene.landmarks
+    assert isinstance(stage, GeometryStage) and found is not None
+    problem = GeometryProblem(stage, scene)
     state = replace(initial_state(learned, 0), pose=np.array([0.1, -0.2, 0.05, 0.1, -0.1, 0.2], np.float32))
     problem.refresh(state)
     start = state.parameters(("pose", "z_sdf", "deformation", "reference"))
@@ -222,7 +224,7 @@ def test_the_reprojection_error_falls_along_its_derivative(prior, found, tmp_pat
             values = {k: mi.Float(v) for k, v in start.items()}
             values[name] = mi.Float(value)
             dr.enable_grad(values[name])
-            return problem._landmark_loss(problem._field(values), scene.landmarks), values[name]
+            return problem._landmark_loss(problem._field(values), found), values[name]
 
         result, value = loss(start[name])
         dr.backward(result)
