@@ -13,7 +13,7 @@ import numpy as np
 from sira_mi.avatar.decoders import diffuse_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.decisions import Decision
-from sira_mi.fields.columns import evaluate_in_chunks, in_three
+from sira_mi.fields.columns import evaluate_in_chunks, to_array
 from sira_mi.fit.residual import albedo_variances
 from sira_mi.fit.shaded import PhotoPoints, Shading, base_albedo, decoder, shade_points
 from sira_mi.fit.skin import skin_patches
@@ -121,7 +121,7 @@ class AppearanceProblem:
         points = self.surface.points[index]
         base, skin_tone = self._base_and_skin(current, index)
         shading = shade_points(self.avatar, current, self._k_s(step), points, base)
-        target = mi.TensorXf(np.ascontiguousarray(self.surface.radiance[:, index]))
+        target = to_array(self.surface.radiance[:, index])
         color = losses.photometric_loss(shading.diffuse + shading.specular, target)
         return {"color": color, **self._prior_losses(current, shading, skin_tone)}
 
@@ -152,7 +152,7 @@ class AppearanceProblem:
             )
             self._base = base, self._skin_loss(self._fixed)
         base, skin = self._base
-        return mi.TensorXf(np.ascontiguousarray(base[:, index])), skin
+        return to_array(base[:, index]), skin
 
     def _skin_loss(self, current: Arrays) -> Any:
         return None if self.surface.skin is None else self.surface.skin.loss(self.avatar, current)
@@ -162,7 +162,7 @@ class AppearanceProblem:
         weights, latents = self.stage.weights, ("z_a", "z_s", "z_l")
         terms = {
             "embedding": weights.embedding * losses.squared_norm(*(current[name] for name in latents)),
-            "white_light": weights.white_light * _chroma(shading.lobes),
+            "white_light": weights.white_light * losses.white_light_loss(shading.lobes[:, 4:7]),
         }
         if skin_tone is not None:
             terms["skin_tone"] = weights.skin_tone * skin_tone
@@ -196,11 +196,3 @@ def scale_light(avatar: Avatar, illumination: np.ndarray, factor: float) -> np.n
     bias = flat[-7 * avatar.architecture.lobes :].reshape(-1, 7)
     bias[:, 4:7] += np.float32(np.log(max(factor, 1e-6)))
     return flat
-
-
-def _chroma(lobes: Any) -> Any:
-    """Mean squared log-chroma of the lobes' amplitudes."""
-    logarithm = dr.log(lobes[:, 4:7])
-    grey = dr.reshape(dr.mean(logarithm, axis=1), (-1, 1))
-    deviation = logarithm - in_three(grey, axis=1)
-    return losses.mean(deviation * deviation)

@@ -19,7 +19,7 @@ from sira_mi.avatar.file import Avatar
 from sira_mi.avatar.landmark_model import LandmarkModel, place_landmarks, reference_landmarks
 from sira_mi.avatar.shape import POSE, SHAPE_LATENTS, SHAPE_NETWORKS, SHAPE_PARAMETERS, HeadShape
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
-from sira_mi.fields.columns import to_columns
+from sira_mi.fields.columns import to_array, to_columns
 from sira_mi.fields.sdf import SdfField, deform, surface
 from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.stage import Arrays, FitSettings, FitTask, Problem, Stage
@@ -91,10 +91,10 @@ def find_landmarks(portrait: Portrait, avatar: Avatar) -> PhotoLandmarks | None:
         return None
     weights = np.where(in_photo, landmark_weights(len(on_head))[on_head], 0).astype(np.float32)
     return PhotoLandmarks(
-        x_ref=mi.TensorXf(np.ascontiguousarray(x_ref)),
+        x_ref=to_array(x_ref),
         x=avatar.tensors["landmarks"][on_head].T.astype(np.float32),
         model=LandmarkModel(avatar),
-        pixels=mi.TensorXf(np.ascontiguousarray(np.nan_to_num(pixels).T, dtype=np.float32)),
+        pixels=to_array(np.nan_to_num(pixels).T),
         weights=mi.TensorXf(weights[None] / weights.sum()),
         face_size=float(np.ptp(pixels[in_photo, 1])),
     )
@@ -247,7 +247,7 @@ class GeometryProblem:
         uniform = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (half, 3))
         vertices = self.scene.head.vertices()
         near = vertices[:, rng.integers(vertices.shape[1], size=half)].T + 0.1 * rng.standard_normal((half, 3))
-        return mi.TensorXf(np.ascontiguousarray(np.concatenate([uniform, near]).T, dtype=np.float32))
+        return to_array(np.concatenate([uniform, near]).T)
 
     def _landmark_loss(self, shape: SdfField, landmarks: PhotoLandmarks) -> Any:
         """Weighted mean reprojection error of the landmarks, in face sizes. One fixed-point step from where they were
@@ -262,14 +262,14 @@ class GeometryProblem:
         projected = projected + mi.TensorXf(matrix[:, 3:].astype(np.float32))
         pixels = projected[0:2, :] / projected[2:3, :]
         offset = (pixels - landmarks.pixels) / landmarks.face_size
-        length = dr.sqrt(dr.sum(offset * offset, axis=0) + 1e-6)
+        length = losses.norm(offset, 1e-6)
         return dr.sum(dr.reshape(length, (1, -1)) * landmarks.weights, axis=None)
 
     def _deformation_change(self, shape: SdfField, parameters: Arrays, rng: np.random.Generator) -> Any:
         """Mean |δ − δ₀| over random points of the domain, δ₀ by the prior's deformation network at the same latent
         code. It keeps what the photo does not show as the prior has it."""
         points = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_CHANGE_POINTS, 3)).astype(np.float32)
-        x = mi.TensorXf(np.ascontiguousarray(points.T))
+        x = to_array(points.T)
         prior = {name: self.scene.avatar.tensors[name] for name in SHAPE_NETWORKS}
         prior |= {name: dr.detach(parameters[name]) for name in (*SHAPE_LATENTS, POSE)}
         return losses.mean(dr.abs(deform(shape, x)[0] - deform(self._field(prior), x)[0]))

@@ -25,7 +25,7 @@ from sira_mi.avatar.decoders import albedo_refinement, diffuse_albedo, refine_al
 from sira_mi.avatar.file import load_avatar
 from sira_mi.decisions import Decision
 from sira_mi.export.scene import head, head_scene, sensor, sg_light
-from sira_mi.fields.columns import evaluate_in_chunks
+from sira_mi.fields.columns import evaluate_in_chunks, to_array
 from sira_mi.fields.sdf import deform
 from sira_mi.fit.appearance import PhotoSurface, share_surface
 from sira_mi.fit.output import head_box
@@ -162,9 +162,7 @@ class PolishProblem(AlbedoRefinementProblem):
         loss = dr.sum(error * error * self.weight, axis=None)
         dr.backward(loss)
         derivatives = {
-            kind: dr.grad(leaf)
-            if kind == "lobes"
-            else mi.TensorXf(np.ascontiguousarray(dr.grad(leaf).numpy().reshape(-1, len(seen[kind])).T))
+            kind: dr.grad(leaf) if kind == "lobes" else to_array(dr.grad(leaf).numpy().reshape(-1, len(seen[kind])).T)
             for kind, leaf in leaves.items()
         }
         return dr.detach(loss), derivatives

@@ -12,6 +12,7 @@ import numpy as np
 
 from sira_mi.avatar.decoders import albedo_refinement, light_refinement, refine_albedo
 from sira_mi.decisions import Decision
+from sira_mi.fields.columns import to_array
 from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fit.appearance import AppearanceProblem, AppearanceStage, AppearanceWeights, share_surface
 from sira_mi.fit.residual import albedo_shares, light_variances, log_residual, share_loss
@@ -98,16 +99,17 @@ class AlbedoRefinementProblem(AppearanceProblem):
 
     def _losses_of(self, points: RefinedPoints, radiance: Any, rng: np.random.Generator) -> Arrays:
         """The losses of a `radiance` [3, N] at the points."""
-        target = mi.TensorXf(np.ascontiguousarray(self.surface.radiance[:, points.index]))
+        target = to_array(self.surface.radiance[:, points.index])
         terms = {
             "color": losses.photometric_loss(radiance, target),
             **self._prior_losses(points.current, points.shading, points.skin_tone),
         }
         moved = points.x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(points.index)))).astype(np.float32))
         octaves = self.avatar.architecture.refinement_octaves
-        rough = points.fine - albedo_refinement(points.network, octaves, moved, points.gamma)
+        beside = albedo_refinement(points.network, octaves, moved, points.gamma)
+        smoothness = losses.smoothness_loss(points.fine, beside)
         terms["refinement"] = self.stage.weights.refinement * self._refinement_loss(points)
-        terms["smoothness"] = self.stage.weights.smoothness * losses.mean(dr.abs(rough))
+        terms["smoothness"] = self.stage.weights.smoothness * smoothness
         return terms
 
     def _refinement_loss(self, points: RefinedPoints) -> Any:
@@ -117,8 +119,7 @@ class AlbedoRefinementProblem(AppearanceProblem):
         base_diffuse = shading.diffuse * (points.base / dr.maximum(points.albedo, 1e-4))
         shadow = dr.maximum(_norm_1(points.base) - _norm_1(base_diffuse), 0.0)
         w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(shading.specular))
-        length = dr.sqrt(dr.sum(points.fine * points.fine, axis=0) + 1e-8)
-        return losses.mean(length * w)
+        return losses.mean(losses.norm(points.fine) * w)
 
 
 class RefinementProblem(AlbedoRefinementProblem):

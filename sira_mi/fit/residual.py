@@ -16,12 +16,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 from skimage.draw import polygon2mask
 
-from sira_mi.fields.columns import in_three
+from sira_mi.fields.columns import in_three, to_array
 from sira_mi.fit.shaded import PhotoPoints
 from sira_mi.fit.skin import near_landmarks
 from sira_mi.optimisation import losses
@@ -123,6 +122,6 @@ def share_loss(base, albedo, light_refinement, shares: np.ndarray):
 
 def _scaled(residual, shares: np.ndarray):
     """A residual [3, N] with its grey and its colour times their `shares` [2, N]."""
-    of_grey, of_colour = (mi.TensorXf(np.ascontiguousarray(row[None], np.float32)) for row in shares)
+    of_grey, of_colour = (to_array(row[None]) for row in shares)
     grey = dr.reshape(dr.mean(residual, axis=0), (1, -1))
     return in_three(grey * (of_grey - of_colour)) + residual * in_three(of_colour)

@@ -88,8 +88,7 @@ def photo_points(portrait: Portrait, head) -> PhotoPoints:
 
 def decoder(avatar: Avatar, name: str, tensors: dict, latent: str | None = None) -> list[tuple]:
     """Layers of the network `name` at `tensors` (Floats)."""
-    z = None if latent is None else mi.TensorXf(tensors[latent], (len(tensors[latent]), 1))
-    return layers(avatar.architecture.networks[name], tensors[name], z)
+    return layers(avatar.architecture.networks[name], tensors[name], None if latent is None else tensors[latent])
 
 
 def decode_lobes(avatar: Avatar, tensors: dict):

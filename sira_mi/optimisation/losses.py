@@ -9,7 +9,7 @@ import mitsuba as mi
 from sira_mi.fields.columns import in_three
 
 
-def _norm(v, epsilon: float = 1e-8):
+def norm(v, epsilon: float = 1e-8):
     """Length [1, N] of the columns of v [rows, N]; smooth at zero."""
     return dr.sqrt(dr.sum(v * v, axis=0) + epsilon)
 
@@ -26,13 +26,13 @@ def surface_loss(distance):
 
 def eikonal_loss(gradient):
     """L_Eik of eq. 7: mean (‖∇f‖ − 1)², gradient [3, N]."""
-    deviation = _norm(gradient) - 1.0
+    deviation = norm(gradient) - 1.0
     return mean(deviation * deviation)
 
 
 def normal_loss(gradient, normal):
     """Mean ‖∇f − n‖ at surface points (IGR, Gropp et al. 2020), both [3, N]."""
-    return mean(_norm(gradient - normal))
+    return mean(norm(gradient - normal))
 
 
 def distance_loss(distance, target, softening: float = 0.1):
@@ -45,7 +45,7 @@ def deformation_loss(delta, scenes: int):
     """L_Def, eq. 5, averaged over scenes: δ [3, S·n], the points of one scene consecutive."""
     per_scene: mi.TensorXf = dr.sum(dr.reshape(delta, (3, scenes, -1)), axis=2)
     n = delta.shape[1] // scenes
-    return mean(_norm(delta)) + mean(_norm(per_scene)) / n
+    return mean(norm(delta)) + mean(norm(per_scene)) / n
 
 
 def landmark_loss(x_ref, scenes: int):
