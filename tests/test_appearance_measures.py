@@ -183,7 +183,7 @@ def test_skin_radiance_is_that_of_the_observations_near_the_landmarks(scene):
 def model():
     """A small avatar whose latents are zero, with albedo decoders that their latents move."""
     avatar = small_avatar()
-    return avatar.replaced(**{name: np.zeros_like(avatar.tensors[name]) for name in SMALL.latents})
+    return avatar.with_tensors(**{name: np.zeros_like(avatar.tensors[name]) for name in SMALL.latents})
 
 
 @pytest.fixture(scope="module")

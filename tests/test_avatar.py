@@ -61,11 +61,11 @@ def test_a_refined_light_comes_back_and_may_be_missing(avatar, tmp_path):
     """A prior has none; one of another size is refused."""
     network = avatar.architecture.networks["light_refinement"]
     assert "light_refinement" not in avatar.tensors
-    refined = avatar.replaced(light_refinement=np.arange(network.parameters, dtype=np.float32))
+    refined = avatar.with_tensors(light_refinement=np.arange(network.parameters, dtype=np.float32))
     save_avatar(tmp_path / "a", refined)
     back = load_avatar(tmp_path / "a").tensors["light_refinement"]
     np.testing.assert_array_equal(back, refined.tensors["light_refinement"])
-    save_avatar(tmp_path / "a", avatar.replaced(light_refinement=np.zeros(3, np.float32)))
+    save_avatar(tmp_path / "a", avatar.with_tensors(light_refinement=np.zeros(3, np.float32)))
     assert "light_refinement" in complaint(tmp_path / "a")
 
 
@@ -76,8 +76,8 @@ def test_the_same_avatar_is_the_same_bytes(avatar, tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_replaced_leaves_the_original_alone(avatar):
-    other = avatar.replaced(z_sdf=np.zeros(6, np.float32))
+def test_with_tensors_leaves_the_original_alone(avatar):
+    other = avatar.with_tensors(z_sdf=np.zeros(6, np.float32))
     assert other.tensors["z_sdf"].sum() == 0 != avatar.tensors["z_sdf"].sum()
 
 
@@ -233,7 +233,7 @@ def test_an_older_file_survives_a_write_that_fails(avatar, tmp_path, monkeypatch
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
     with pytest.raises(InputError, match="No space left"):
-        save_avatar(path, avatar.replaced(z_sdf=np.ones(6, np.float32)))
+        save_avatar(path, avatar.with_tensors(z_sdf=np.ones(6, np.float32)))
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 

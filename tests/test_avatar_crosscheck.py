@@ -103,7 +103,7 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     (bad / "damaged").write_bytes(b"\x80 this is none of these")
     reference = avatar.tensors["reference"].copy()
     reference[-1] += 100.0
-    save_avatar(bad / "no surface", avatar.replaced(reference=reference))
+    save_avatar(bad / "no surface", avatar.with_tensors(reference=reference))
     options = {"avatar": avatar_path, "--spp": "2", "--size": "8", "--out": str(out)}
     for key, value in change.items():
         options[key] = str(bad / value) if key in ("avatar", "--lights", "--out") else value

@@ -245,6 +245,6 @@ def test_a_fit_at_rates_a_thousand_times_too_high_keeps_its_head(tmp_path, capsy
     assert progress.notes and "note: the fit diverged" in capsys.readouterr().err
     assert all(np.isfinite(value).all() for value in progress.state.arrays().values())
     shape = progress.state.parameters(("z_sdf", "deformation"))
-    save_avatar(tmp_path / "a.safetensors", prior.replaced(**shape))
+    save_avatar(tmp_path / "a.safetensors", prior.with_tensors(**shape))
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(tmp_path / "a.safetensors"), "voxel": 0.16})
     assert np.isfinite(head.vertices()).all()

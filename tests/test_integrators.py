@@ -269,7 +269,7 @@ def test_a_refined_light_multiplies_the_radiance_alone(avatar, avatar_path, tmp_
     network = avatar.architecture.networks["light_refinement"]
     parameters = initial_parameters(network, rng, output_scale=0.5)
     path = tmp_path / "refined.safetensors"
-    save_avatar(path, avatar.replaced(light_refinement=parameters))
+    save_avatar(path, avatar.with_tensors(light_refinement=parameters))
 
     def image(**options):
         integrator = {"type": "sira_sg", "hide_emitters": True, "exact": exact, **options}

@@ -127,7 +127,7 @@ def prior():
     landmarks = rng.uniform(-1, 1, (LANDMARKS, 3)).astype(np.float32)
     landmarks[[5, 100]] = np.nan
     avatar = small_avatar()
-    return avatar.replaced(landmarks=landmarks, **{name: 0 * avatar.tensors[name] for name in SMALL.latents})
+    return avatar.with_tensors(landmarks=landmarks, **{name: 0 * avatar.tensors[name] for name in SMALL.latents})
 
 
 @pytest.fixture(scope="module")
@@ -165,11 +165,11 @@ def test_damaged_landmark_models_are_refused(prior, found, tmp_path):
     tensors = landmark_tensors(prior, found.placed, found.true)
     path = tmp_path / "prior.safetensors"
     for name, values in tensors.items():
-        save_avatar(path, prior.replaced(**{**tensors, name: values[:0]}))
+        save_avatar(path, prior.with_tensors(**{**tensors, name: values[:0]}))
         with pytest.raises(InputError) as error:
             load_avatar(path)
         one_line(error, "damaged")
-        save_avatar(path, prior.replaced(**{k: v for k, v in tensors.items() if k != name}))
+        save_avatar(path, prior.with_tensors(**{k: v for k, v in tensors.items() if k != name}))
         with pytest.raises(InputError) as error:
             load_avatar(path)
         one_line(error, name)

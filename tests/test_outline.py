@@ -23,7 +23,7 @@ def test_the_derivative_of_the_mask_loss_is_that_of_its_values(variant, avatar, 
     inside the mask: which rays these are, no derivative sees, and the integral is off by up to twice the change."""
     size = 160
     view = camera(focal=150, size=size)
-    avatar = avatar.replaced(landmarks=np.zeros((468, 3), np.float32))  # the photo has none
+    avatar = avatar.with_tensors(landmarks=np.zeros((468, 3), np.float32))  # the photo has none
     head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": 0.1})
     seen = seen_points(view, head)
     mask = np.zeros((size, size), np.float32)

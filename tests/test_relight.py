@@ -86,7 +86,7 @@ def test_baked_albedos_follow_every_parameter(avatar, avatar_path, tmp_path):
     params["head.bsdf.specular_albedo.latent"] = mi.Float(other["z_s"])
     params.update()
     path = tmp_path / "changed.safetensors"
-    save_avatar(path, avatar.replaced(diffuse_albedo=other["diffuse_albedo"], z_s=other["z_s"]))
+    save_avatar(path, avatar.with_tensors(diffuse_albedo=other["diffuse_albedo"], z_s=other["z_s"]))
     np.testing.assert_array_equal(albedos(scene)[0], albedos(baked_scene(path))[0])
     assert np.abs(albedos(scene)[0] - before).max() > 0.05
 
@@ -274,10 +274,10 @@ def test_bad_input_is_said_and_writes_nothing(change, message, avatar, avatar_pa
     (bad / "empty folder").mkdir(parents=True)
     for name in ("damaged", "damaged.json", "damaged.exr"):
         (bad / name).write_bytes(b"\x80 this is none of these")
-    save_avatar(bad / "nan", avatar.replaced(z_sdf=np.full_like(avatar.tensors["z_sdf"], np.nan)))
+    save_avatar(bad / "nan", avatar.with_tensors(z_sdf=np.full_like(avatar.tensors["z_sdf"], np.nan)))
     reference = avatar.tensors["reference"].copy()
     reference[-1] += 100.0
-    save_avatar(bad / "no surface", avatar.replaced(reference=reference))
+    save_avatar(bad / "no surface", avatar.with_tensors(reference=reference))
     (bad / "bad report").mkdir()
     save_avatar(bad / "bad report" / "avatar.safetensors", avatar)
     (bad / "bad report" / "avatar.json").write_text("{")

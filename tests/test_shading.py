@@ -27,7 +27,7 @@ SETTINGS = replace(QUALITIES["draft"], rays=SIZE * SIZE, points=64, voxel=0.1)
 def problem(variant, avatar, tmp_path_factory):
     """A head before the photo that eq. 8 makes of it, whose mask leaves out the head's rim: small changes of the head
     leave the same pixels in it. Without shadows: their edges, which no derivative sees, have tests of their own."""
-    avatar = avatar.replaced(landmarks=np.zeros((468, 3), np.float32))  # the photo has none
+    avatar = avatar.with_tensors(landmarks=np.zeros((468, 3), np.float32))  # the photo has none
     none = np.full((468, 2), np.nan)
     blank = Portrait(
         np.zeros((SIZE, SIZE, 3), np.float32), np.ones((SIZE, SIZE), np.float32), none, none, camera(60, SIZE), ()

@@ -79,7 +79,7 @@ def test_differentiable_hit_moves_as_the_traced_hit_does(avatar, name):
 
     def loss(value):
         """Mean weighted hit by bisection in float64."""
-        head = avatar.replaced(**{name: value})
+        head = avatar.with_tensors(**{name: value})
         near, far = np.full(200, 1.8), np.full(200, 4.0)
         for _ in range(45):
             middle = 0.5 * (near + far)

@@ -55,7 +55,7 @@ class Avatar:
             )
         return self.skin
 
-    def replaced(self, **tensors: np.ndarray) -> "Avatar":
+    def with_tensors(self, **tensors: np.ndarray) -> "Avatar":
         """The same avatar with some tensors replaced."""
         return dataclasses.replace(self, tensors={**self.tensors, **tensors})
 

@@ -211,7 +211,7 @@ def assemble_avatar(prior: Avatar, progress: Progress, settings: FitSettings) ->
     parameters = progress.state.avatar
     lobes = decode_lobes(prior, {k: mi.Float(parameters[k]) for k in ("illumination", "z_l")}).numpy()
     reached = settings.stages[min(progress.stage, len(settings.stages) - 1)]
-    return replace(prior.replaced(**parameters, lobes=lobes), k_s=reached.k_s[1], k_r=reached.k_r)
+    return replace(prior.with_tensors(**parameters, lobes=lobes), k_s=reached.k_s[1], k_r=reached.k_r)
 
 
 def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float) -> None:

@@ -124,7 +124,7 @@ class FitTask:
     def write_avatar(self, state: FitState) -> Path:
         """Writes the avatar at `state` for the plugins to read; its path."""
         path = self.folder / "avatar.safetensors"
-        save_avatar(path, self.prior.replaced(**state.avatar))
+        save_avatar(path, self.prior.with_tensors(**state.avatar))
         return path
 
     def share(self, kind: type[Shared], make: Callable[[], Shared]) -> Shared:

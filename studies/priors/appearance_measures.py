@@ -316,7 +316,7 @@ def primary_hits(
 
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "head.safetensors")
-        save_avatar(path, avatar.replaced(z_sdf=np.asarray(z_sdf, np.float32)))
+        save_avatar(path, avatar.with_tensors(z_sdf=np.asarray(z_sdf, np.float32)))
         scene = mi.load_dict({"type": "scene", "head": {"type": "neural_sdf", "avatar": path, "voxel": voxel}})
     head = scene.shapes()[0]
     row, column = (a.ravel() + 0.5 for a in np.indices(size))

@@ -42,7 +42,7 @@ def place_landmarks(prior: Avatar, scenes: Sequence[TrainingScene], fit: ShapeFi
 
 
 def add_landmark_model(prior: Avatar, found: Places) -> Avatar:
-    return prior.replaced(**landmark_tensors(prior, found.placed, found.true))
+    return prior.with_tensors(**landmark_tensors(prior, found.placed, found.true))
 
 
 def measure_held_out_errors(prior: Avatar, found: Places) -> tuple[float, float]:
