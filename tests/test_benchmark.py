@@ -14,7 +14,7 @@ import trimesh
 
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.portrait.camera import focal_from_exif
+from sira_mi.portrait.camera import convert_exif_focal
 from sira_mi.portrait.load import linear_to_srgb, load_photo
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.lighting import map_directions, render_lobes
@@ -123,7 +123,7 @@ def test_the_camera_has_the_focal_length_of_its_exif_tag_and_shows_the_hair(sphe
     """The focal length in pixels is what the portrait front end reads from EXIF; the highest point is in the picture,
     and the head's middle in the middle column."""
     K, pose = portrait_camera([sphere], -40, 8, 62.0, 4.6, 512)
-    assert K[0, 0] == pytest.approx(focal_from_exif(62.0, 512, 512), rel=1e-6)
+    assert K[0, 0] == pytest.approx(convert_exif_focal(62.0, 512, 512), rel=1e-6)
     assert K[0, 2] == K[1, 2] == 256
     pixels, depth = project(np.array([[0, 1.2, 0], [0.0, 0, 0]]), K, pose)
     assert 10 < pixels[0, 1] < 80 and abs(pixels[1, 0] - 256) < 1e-6

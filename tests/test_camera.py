@@ -12,7 +12,7 @@ from sira_mi.portrait import (
     Camera,
     PortraitSettings,
     estimate_camera,
-    reprojection_error,
+    measure_reprojection_error,
 )
 
 SETTINGS = PortraitSettings(working_size=512)
@@ -90,7 +90,7 @@ def test_known_focal_length_gives_pose_and_distance(head, yaw, pitch, roll, dist
     turn = found.world_to_camera[:3, :3] @ camera.world_to_camera[:3, :3].T
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 0.5
     assert np.linalg.norm(found.centre) == pytest.approx(np.linalg.norm(camera.centre), rel=0.02)
-    assert reprojection_error(found, pixels, head) < 1.0
+    assert measure_reprojection_error(found, pixels, head) < 1.0
 
 
 def test_unknown_focal_length_stays_near_the_prior_and_fits(head):
@@ -102,7 +102,7 @@ def test_unknown_focal_length_stays_near_the_prior_and_fits(head):
             camera = a_camera(yaw=5.0, distance=distance, focal=110.0 * distance)
             pixels = camera.project(head * [1, 1, depth])
             estimate = estimate_camera(pixels, head, 640, 800)
-            assert reprojection_error(estimate, pixels, head) < 1.0
+            assert measure_reprojection_error(estimate, pixels, head) < 1.0
             assert estimate.K[0, 0] == estimate.K[1, 1] and tuple(estimate.K[:2, 2]) == (320, 400)
             found[distance, depth] = np.linalg.norm(estimate.centre)
     assert all(8.5 < found[12.0, depth] < 15.0 for depth in (0.7, 1.0, 1.4))

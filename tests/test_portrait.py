@@ -18,7 +18,7 @@ from sira_mi.portrait import (
     load_mask,
     load_photo,
     make_portrait,
-    reprojection_error,
+    measure_reprojection_error,
     segment_person,
     select_face,
     srgb_to_linear,
@@ -218,7 +218,7 @@ def test_portrait_of_the_test_photo(photo_file, head, astronaut, mask):
     np.testing.assert_allclose(portrait.image, srgb_to_linear(astronaut / 255.0), atol=1e-6)
     assert portrait.mask.shape == (512, 512) and portrait.landmarks.shape == (LANDMARKS, 2)
     assert np.array_equal(portrait.mask, mask)
-    assert reprojection_error(portrait.camera, portrait.head_landmarks, head) < 3
+    assert measure_reprojection_error(portrait.camera, portrait.head_landmarks, head) < 3
     assert portrait.camera.world_to_camera[2, 3] > 4
     again = make_portrait(photo_file, SETTINGS, head)
     assert np.array_equal(again.image, portrait.image) and np.array_equal(again.mask, portrait.mask)
@@ -234,7 +234,7 @@ def test_small_face_in_a_large_photo_is_cropped(tmp_path, head, astronaut, face)
     size = np.ptp(portrait.landmarks, axis=0).max()
     assert size > 0.2 * 256
     np.testing.assert_allclose(portrait.camera.K[0, 0], portrait.camera.K[1, 1])
-    assert reprojection_error(portrait.camera, portrait.head_landmarks, head) < 0.03 * size
+    assert measure_reprojection_error(portrait.camera, portrait.head_landmarks, head) < 0.03 * size
     relit = find_faces((linear_to_srgb(portrait.image) * 255 + 0.5).astype(np.uint8))[0]
     assert np.linalg.norm(relit.landmarks - portrait.landmarks, axis=1).mean() < 2
     assert portrait.mask[tuple(portrait.landmarks[1].astype(int)[::-1])] == 1
@@ -252,7 +252,7 @@ def test_given_camera_is_made_square_and_follows_the_image(tmp_path, photo_file,
     )
     assert portrait.camera.K[0, 0] == pytest.approx(portrait.camera.K[1, 1])
     assert portrait.image.shape == (400, 400, 3)
-    assert reprojection_error(portrait.camera, portrait.landmarks, head) < 2
+    assert measure_reprojection_error(portrait.camera, portrait.landmarks, head) < 2
     assert not any("away from the face" in note for note in portrait.notes)
 
 

@@ -25,7 +25,7 @@ from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around,
 from sira_mi.fit.stage import Arrays, FitSettings, FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
-from sira_mi.portrait.camera import landmark_weights
+from sira_mi.portrait.camera import weigh_landmarks
 from sira_mi.portrait.portrait import Portrait
 
 # Where the scene keeps the parameters of the geometry stages.
@@ -89,7 +89,7 @@ def find_landmarks(portrait: Portrait, avatar: Avatar) -> PhotoLandmarks | None:
     in_photo = np.isfinite(pixels).all(axis=1)
     if in_photo.sum() < _FEWEST_LANDMARKS:
         return None
-    weights = np.where(in_photo, landmark_weights(len(on_head))[on_head], 0).astype(np.float32)
+    weights = np.where(in_photo, weigh_landmarks(len(on_head))[on_head], 0).astype(np.float32)
     return PhotoLandmarks(
         x_ref=to_array(x_ref),
         x=avatar.tensors["landmarks"][on_head].T.astype(np.float32),

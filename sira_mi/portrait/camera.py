@@ -113,12 +113,12 @@ class Camera:
         return Camera(K, pose, width, height)
 
 
-def focal_from_exif(focal_35mm: float, width: int, height: int) -> float:
+def convert_exif_focal(focal_35mm: float, width: int, height: int) -> float:
     """A focal length on 35 mm film (mm, equal diagonals) in pixels of an image of that size."""
     return focal_35mm * float(np.hypot(width, height)) / _FILM_DIAGONAL
 
 
-def landmark_weights(count: int) -> np.ndarray:
+def weigh_landmarks(count: int) -> np.ndarray:
     """Weights `[count]` of the landmarks for the pose: high on rigid parts, low where expressions move the face.
 
     A number of landmarks other than `LANDMARKS` is weighted evenly."""
@@ -148,9 +148,9 @@ def estimate_camera(
     usable = np.isfinite(landmarks).all(axis=1) & np.isfinite(head_landmarks).all(axis=1)
     if usable.sum() < 6:
         raise ValueError(f"{usable.sum()} landmarks are known on both sides: 6 are needed")
-    weights = landmark_weights(len(landmarks))[usable]
+    weights = weigh_landmarks(len(landmarks))[usable]
     points, pixels = head_landmarks[usable], landmarks[usable]
-    known_focal = None if focal_35mm is None else focal_from_exif(focal_35mm, width, height)
+    known_focal = None if focal_35mm is None else convert_exif_focal(focal_35mm, width, height)
     focal = known_focal or _focal_at_distance(points, pixels, _MEDIAN_DISTANCE)
     rotation, translation = _initial_pose(points, pixels, focal, width, height)
 
@@ -176,14 +176,14 @@ def estimate_camera(
     return Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]]), pose, width, height)
 
 
-def reprojection_error(camera: Camera, landmarks: np.ndarray, head_landmarks: np.ndarray) -> float:
+def measure_reprojection_error(camera: Camera, landmarks: np.ndarray, head_landmarks: np.ndarray) -> float:
     """Weighted root mean square distance, in pixels, between `landmarks` `[L, 2]` and the projected `head_landmarks`
     `[L, 3]`; infinite when some lie behind the camera, NaN when no landmark is known on both sides."""
     usable = np.isfinite(landmarks).all(axis=1) & np.isfinite(head_landmarks).all(axis=1)
     if not usable.any():
         return float("nan")
     squared = ((camera.project(head_landmarks[usable]) - landmarks[usable]) ** 2).sum(axis=1)
-    weights = landmark_weights(len(landmarks))[usable]
+    weights = weigh_landmarks(len(landmarks))[usable]
     return float("inf") if np.isnan(squared).any() else float(np.sqrt((weights * squared).sum() / weights.sum()))
 
 

@@ -8,7 +8,7 @@ from scipy.sparse import csr_matrix
 
 from sira_mi.conventions import LANDMARKS, LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.portrait.camera import Camera, estimate_camera, reprojection_error
+from sira_mi.portrait.camera import Camera, estimate_camera, measure_reprojection_error
 from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.head_landmarks import correct_landmarks
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
@@ -100,7 +100,7 @@ def make_portrait(
         working_face = Face(landmarks, found.depth * window.scale_x, found.presence)
     mask = _make_mask(photo, given_mask, window, image, working_face, notes)
     if given_camera is not None and working_face is not None:
-        error = reprojection_error(camera, of_head, np.asarray(mean_landmarks, np.float64))
+        error = measure_reprojection_error(camera, of_head, np.asarray(mean_landmarks, np.float64))
         if error > _CAMERA_MISMATCH * working_face.size:
             notes.append(f"the given camera shows the head {error:.0f} pixels away from the face in the photo")
     return Portrait(image.astype(np.float32), mask.astype(np.float32), landmarks, of_head, camera, tuple(notes))
@@ -175,7 +175,7 @@ def _fit_camera(
 ) -> Camera:
     height, width = photo.image.shape[:2]
     camera = estimate_camera(landmarks, mean_landmarks, width, height, photo.focal_35mm)
-    error = reprojection_error(camera, landmarks, np.asarray(mean_landmarks, np.float64))
+    error = measure_reprojection_error(camera, landmarks, np.asarray(mean_landmarks, np.float64))
     source = "the photo's EXIF data" if photo.focal_35mm is not None else "the face and a usual distance"
     distance = np.linalg.norm(camera.centre) * MILLIMETRES_PER_UNIT / 1000
     notes.append(
