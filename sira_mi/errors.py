@@ -2,7 +2,9 @@
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 
@@ -15,6 +17,21 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; --help lists the options")
+
+
+def check_range(name: str, value: float | None, low: float, high: float) -> None:
+    """Raises InputError when an option's value is below `low`, above `high` or NaN; None is an option not given."""
+    if value is not None and not low <= value <= high:
+        raise InputError(f"--{name} is {value}; it must be {low} to {high}")
+
+
+def check_writable(folder: Path) -> None:
+    """Raises InputError when no file can be written to the folder of the option `--out`."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
 
 
 def run_command(main: Callable[[], int | None]) -> None:

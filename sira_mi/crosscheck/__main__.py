@@ -2,10 +2,9 @@
 
 import argparse
 import math
-import tempfile
 from pathlib import Path
 
-from sira_mi.errors import CommandParser, InputError, run_command
+from sira_mi.errors import CommandParser, InputError, check_range, check_writable, run_command
 
 _DESCRIPTION = """\
 Renders a fitted head in closed form and by path tracing, with the same camera and lobes, and writes their difference
@@ -33,19 +32,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check(options: argparse.Namespace) -> None:
-    for name, low, high in (("size", 8, 4096), ("spp", 2, 1 << 20), ("seed", 0, 2**32 - 2)):
-        value = getattr(options, name)
-        if not low <= value <= high:
-            raise InputError(f"--{name} is {value}; it must be {low} to {high}")
+    check_range("size", options.size, 8, 4096)
+    check_range("spp", options.spp, 2, 1 << 20)
+    check_range("seed", options.seed, 0, 2**32 - 2)
     if not math.isfinite(options.yaw):
         raise InputError(f"--yaw is {options.yaw}; it must be a number of degrees")
     if not options.out.is_dir():
         raise InputError(f"{options.out} is not a folder; make it, or give another with --out")
-    try:
-        with tempfile.TemporaryFile(dir=options.out):
-            pass
-    except OSError as error:
-        raise InputError(f"cannot write to {options.out}: {error.strerror}; choose another --out") from error
+    check_writable(options.out)
 
 
 def main(arguments: list[str] | None = None) -> int:

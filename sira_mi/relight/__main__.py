@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sira_mi.errors import CommandParser, InputError, run_command
+from sira_mi.errors import CommandParser, InputError, check_range, check_writable, run_command
 
 if TYPE_CHECKING:
     from sira_mi.plugins.neural_sdf import NeuralSDF
@@ -77,17 +76,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _check_range(name: str, value: float | None, low: float, high: float) -> None:
-    if value is not None and not low <= value <= high:
-        raise InputError(f"--{name} is {value}; it must be {low} to {high}")
-
-
 def _check(options: argparse.Namespace) -> None:
-    _check_range("spp", options.spp, 1, _MAXIMUM_SAMPLES)
-    _check_range("size", options.size, 1, _MAXIMUM_SIZE)
-    _check_range("turntable", options.turntable, 1, _MAXIMUM_FRAMES)
-    _check_range("seed", options.seed, 0, 2**32 - 1)
-    _check_range("exposure", options.exposure, -30, 30)
+    check_range("spp", options.spp, 1, _MAXIMUM_SAMPLES)
+    check_range("size", options.size, 1, _MAXIMUM_SIZE)
+    check_range("turntable", options.turntable, 1, _MAXIMUM_FRAMES)
+    check_range("seed", options.seed, 0, 2**32 - 1)
+    check_range("exposure", options.exposure, -30, 30)
     if options.exact and options.integrator == "sg" and not options.compare:
         raise InputError("--exact belongs to --integrator path; closed-form shading is exact without --draft")
     if options.draft and (options.integrator == "path" or options.compare):
@@ -108,11 +102,7 @@ def output_stem(out: Path) -> Path:
     stem = out.with_suffix("") if out.suffix.lower() in _ENDINGS else out
     if not stem.name:
         raise InputError(f"--out {out} names no file")
-    try:
-        with tempfile.TemporaryFile(dir=stem.parent):
-            pass
-    except OSError as error:
-        raise InputError(f"cannot write to {stem.parent}: {error.strerror}; choose another --out") from error
+    check_writable(stem.parent)
     return stem
 
 

@@ -99,7 +99,7 @@ def _read_camera(report: Path) -> Camera:
     return Camera.from_dict(data["camera"], f"the camera in {report}")
 
 
-def read_light(path: Path | None, avatar: Avatar, lobes: bool, count: int = 64) -> Light:
+def read_light(path: Path | None, avatar: Avatar, lobes: bool, count: int = EnvironmentFit.lobes) -> Light:
     """The light of a `.json` or `.exr` file; without one the avatar's own, which was fitted to the photo. With `lobes`,
     an `.exr` is replaced by `count` lobes that are fitted to it.
 
