@@ -6,13 +6,16 @@ grid, and one Newton step on the field itself places and shades the hits.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import affine_transform
 
+from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
+from sira_mi.avatar.shape import HeadShape, head_of
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.extraction import EmptySurfaceError, ExtractedSurface, extract
@@ -133,17 +136,25 @@ def sheet(rows: list[list[np.ndarray]]) -> np.ndarray:
 
 
 def shape_picture(
-    path: Path, model: ShapeModel, latents: np.ndarray, scenes: list[TrainingScene], seed: int = 0
+    path: Path,
+    architecture: AvatarArchitecture,
+    parameters: Mapping[str, np.ndarray],
+    scenes: list[TrainingScene],
+    seed: int = 0,
 ) -> None:
     """Writes the state of a SA-SM: above, the mean head, the first two latent directions at −2σ and +2σ and a random
-    sample; below, three scenes beside what their latents [dim, scenes] give."""
+    sample; below, three scenes beside the heads of their latents."""
+    model = ShapeModel.of_training(architecture, parameters)
     directions = np.eye(model.bases["z_sdf"].shape[1], dtype=np.float32)[:2]
     random = np.random.default_rng([seed, 6]).standard_normal(directions.shape[1])
     heads = [0 * random, *(sign * 2 * d for d in directions for sign in (-1, 1)), random]
     above = [head_tile(model.field(model.latent("z_sdf", w))) for w in heads]
     below = []
     for k in np.unique(np.linspace(0, len(scenes) - 1, 3).round().astype(int)):
-        below += [scan_tile(scenes[k].points, scenes[k].normals), head_tile(model.field(latents[:, k]))]
+        below += [
+            scan_tile(scenes[k].points, scenes[k].normals),
+            head_tile(HeadShape(architecture).field(head_of(parameters, k))),
+        ]
     write_png(path, sheet([above, below]))
 
 
@@ -152,13 +163,19 @@ class AppearancePicture:
 
     The frozen deformation is evaluated at the points once, when the object is made."""
 
-    def __init__(self, model: ShapeModel, latents: np.ndarray, scenes: list[TrainingScene], roughness: float):
-        """`latents` [dim, scenes] of the SA-SM."""
-        self.architecture, self.roughness = model.architecture, roughness
+    def __init__(
+        self,
+        architecture: AvatarArchitecture,
+        shape: Mapping[str, np.ndarray],
+        scenes: list[TrainingScene],
+        roughness: float,
+    ):
+        """`shape` are the parameters of the SA-SM."""
+        self.architecture, self.roughness = architecture, roughness
         self.chosen = np.unique(np.linspace(0, len(scenes) - 1, 3).round().astype(int))
         self.points, self.frozen = [scenes[k].points for k in self.chosen], []
         for k, points in zip(self.chosen, self.points, strict=True):
-            field = model.field(latents[:, k])
+            field = HeadShape(architecture).field(head_of(shape, k))
             _, gradient, x_ref, gamma = evaluate_in_chunks(lambda x, field=field: surface(field, x), points.T)
             self.frozen.append((unit_columns(gradient), x_ref, gamma))
 

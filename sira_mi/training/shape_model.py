@@ -6,6 +6,7 @@ latents have any mean and spread, and those of a prior, whose latents are standa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,7 @@ class ShapeModel:
     bases: dict[str, np.ndarray]
 
     @staticmethod
-    def of_training(architecture: AvatarArchitecture, parameters: dict[str, np.ndarray]) -> ShapeModel:
+    def of_training(architecture: AvatarArchitecture, parameters: Mapping[str, np.ndarray]) -> ShapeModel:
         """From the parameters of a training, latents [dim, scenes]: the Gaussian of the scenes' latents, its widest
         directions first."""
         moments = {name: whitening(parameters[name].astype(np.float64)) for name in LATENTS}

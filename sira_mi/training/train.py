@@ -23,7 +23,6 @@ from sira_mi.training.pictures import AppearancePicture, shape_picture
 from sira_mi.training.prior import assemble_prior
 from sira_mi.training.sa_sm import LATENTS, NETWORKS
 from sira_mi.training.scenes import load_training_scenes
-from sira_mi.training.shape_model import ShapeModel
 
 # The loss terms of each model whose weight λ is a setting of that name.
 SHAPE_TERMS = (
@@ -117,8 +116,7 @@ def train_shape(
         return sa_sm.training_step(architecture, sa_sm.weights_at(settings, number), optimizer, batch)
 
     def picture(path: Path, parameters: dict[str, np.ndarray]) -> None:
-        model = ShapeModel.of_training(architecture, parameters)
-        shape_picture(path, model, parameters["z_sdf"], scenes, seed)
+        shape_picture(path, architecture, parameters, scenes, seed)
 
     return run_training(
         out,
@@ -165,7 +163,7 @@ def train_appearance(
     if any(shape[name].shape != (architecture.networks[name].parameters,) for name in NETWORKS):
         raise InputError(f"{checkpoint} does not fit its architecture; train it again")
     if any(shape[name].shape != (architecture.latents[name], len(scenes)) for name in LATENTS):
-        raise InputError(f"{out} was trained on {shape['z_sdf'].shape[1]} scenes, {collection} has {len(scenes)}")
+        raise InputError(f"{out} was trained on {shape[LATENTS[0]].shape[1]} scenes, {collection} has {len(scenes)}")
     frozen = [
         af_sm.freeze_scene(architecture, head_of(shape, k), scene, settings, np.random.default_rng([seed, 5, k]))
         for k, scene in enumerate(scenes)
@@ -177,7 +175,6 @@ def train_appearance(
         batch = af_sm.draw_batch(frozen, settings, np.random.default_rng([seed, 3, number]))
         return af_sm.training_step(architecture, settings, optimizer, batch)
 
-    model = ShapeModel.of_training(architecture, shape)
     appearance = run_training(
         out,
         "appearance",
@@ -187,7 +184,7 @@ def train_appearance(
         step,
         weights={name: getattr(settings, name) for name in APPEARANCE_TERMS},
         description=describe(architecture, settings, seed),
-        picture=AppearancePicture(model, shape["z_sdf"], scenes, settings.roughness).write,
+        picture=AppearancePicture(architecture, shape, scenes, settings.roughness).write,
         picture_steps=picture_steps,
     )
     landmarks = np.stack([scene.landmarks for scene in scenes])
