@@ -9,9 +9,13 @@ import mitsuba as mi
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
-    *(ROOT / "docs" / name for name in ("README.md", "architecture.md", "measurements.md")),
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("scenes/**/*.md"), ROOT / "studies" / "README.md"]
+HISTORY = "CHANGELOG.md"
+SOURCES = [
+    p
+    for f in ("sira_mi", "plugins", "studies", "scenes")
+    for p in (ROOT / f).rglob("*.*")
+    if p.suffix in (".py", ".xml")
 ]
 EQUATIONS = ["1", "2a", "2b", "3", "4", "5", "6", "7", "8", "9a", "9b", "10", "11", "12", "13"]
 
@@ -78,6 +82,19 @@ def _anchors(page: Path) -> list[str]:
     return [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
 
 
+def _missing_names(text: str) -> list[str]:
+    """The commands, modules, functions and paths in a text that do not exist; NAME and * stand for any."""
+    missing = []
+    for command in re.findall(r"python -m ((?:sira_mi|studies)(?:\.\w+)*)", text):
+        file = _module_file([*command.split("."), "__main__"]) or _module_file(command.split("."))
+        if "NAME" not in command and (file is None or file.name == "__init__.py"):
+            missing.append(f"python -m {command}")
+    missing += [n for n in re.findall(r"`((?:sira_mi|studies)(?:\.\w+)+)`", text) if not _definition(n)]
+    paths = re.findall(r"(?:`|python )((?:sira_mi|plugins|studies|docs|tests|scenes)/[\w./-]*)", text)
+    paths += [f"tests/{name}" for name in re.findall(r"\b(test_\w+\.py)", text)]
+    return missing + [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_names_and_commands_exist(page):
     """Links of a page lead to files and headings; the modules, commands and paths that it names exist."""
@@ -87,15 +104,15 @@ def test_links_names_and_commands_exist(page):
         file = page.parent / target if target else page
         if not file.exists() or (heading and heading not in _anchors(file)):
             missing.append(f"{target}#{heading}")
-    for command in re.findall(r"python -m ((?:sira_mi|studies)(?:\.\w+)*)", text):
-        file = _module_file([*command.split("."), "__main__"]) or _module_file(command.split("."))
-        if file is None or file.name == "__init__.py":
-            missing.append(f"python -m {command}")
-    missing += [n for n in re.findall(r"`((?:sira_mi|studies)(?:\.\w+)+)`", text) if not _definition(n)]
-    paths = re.findall(r"(?:`|python )((?:sira_mi|plugins|studies|docs|tests|scenes)/[\w./-]*)", text)
-    paths += [f"tests/{name}" for name in re.findall(r"`(test_\w+\.py)`", text)]
-    missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
+    if page.name != HISTORY:
+        missing += _missing_names(text)
     assert not missing
+
+
+def test_names_in_the_sources_exist():
+    """Docstrings, messages and scene files name commands, modules and paths that exist."""
+    missing = {str(path.relative_to(ROOT)): _missing_names(_read(path)) for path in SOURCES}
+    assert not {path: names for path, names in missing.items() if names}
 
 
 def test_each_equation_is_in_one_place():
