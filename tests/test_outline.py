@@ -10,7 +10,7 @@ from conftest import camera
 
 from sira_mi.fit.geometry import GeometryProblem, GeometryScene
 from sira_mi.fit.settings import QUALITIES
-from sira_mi.fit.shaded import seen_points
+from sira_mi.fit.shaded import find_surface_points
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.portrait import Portrait
 
@@ -25,7 +25,7 @@ def test_the_derivative_of_the_mask_loss_is_that_of_its_values(variant, avatar, 
     view = camera(focal=150, size=size)
     avatar = avatar.with_tensors(landmarks=np.zeros((468, 3), np.float32))  # the photo has none
     head = mi.load_dict({"type": "neural_sdf", "avatar": avatar_path, "voxel": 0.1})
-    seen = seen_points(view, head)
+    seen = find_surface_points(view, head)
     mask = np.zeros((size, size), np.float32)
     mask[seen.row, seen.column] = 1
     assert 0.1 < mask.mean() < 0.6 and not mask[0].any()

@@ -101,12 +101,12 @@ def test_an_eye_that_misleads_hardly_counts(variant):
 @pytest.mark.slow
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     """The loss is lowest where the albedo at the landmarks has the expected luminance."""
-    from sira_mi.fit.shaded import base_albedo, masked_points
+    from sira_mi.fit.shaded import base_albedo, find_masked_points
     from sira_mi.fit.skin import skin_cues, skin_luminance, skin_patches
 
     prior = load_avatar(PRIOR)
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(PRIOR), "voxel": 0.1})
-    points = masked_points(portrait, head)
+    points = find_masked_points(portrait, head)
     floats = {name: mi.Float(value) for name, value in FitState.of_avatar(prior).avatar.items()}
     patches = skin_patches(portrait, points)
     assert len(patches.points.row) > 6

@@ -15,9 +15,9 @@ from sira_mi.avatar.file import Avatar
 from sira_mi.decisions import Decision
 from sira_mi.fields.columns import evaluate_in_chunks, to_array
 from sira_mi.fit.residual import albedo_variances
-from sira_mi.fit.shaded import PhotoPoints, Shading, base_albedo, decoder, shade_points
+from sira_mi.fit.shaded import Arrays, PhotoPoints, Shading, base_albedo, decoder, shade_points
 from sira_mi.fit.skin import skin_patches
-from sira_mi.fit.stage import Arrays, FitTask, Problem, Stage
+from sira_mi.fit.stage import FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
 

@@ -22,7 +22,8 @@ from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_array, to_columns
 from sira_mi.fields.sdf import SdfField, deform, surface
 from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
-from sira_mi.fit.stage import Arrays, FitSettings, FitTask, Problem, Stage
+from sira_mi.fit.shaded import Arrays
+from sira_mi.fit.stage import FitSettings, FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
 from sira_mi.portrait.camera import weigh_landmarks
@@ -268,8 +269,7 @@ class GeometryProblem:
     def _deformation_change(self, shape: SdfField, parameters: Arrays, rng: np.random.Generator) -> Any:
         """Mean |δ − δ₀| over random points of the domain, δ₀ by the prior's deformation network at the same latent
         code. It keeps what the photo does not show as the prior has it."""
-        points = rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_CHANGE_POINTS, 3)).astype(np.float32)
-        x = to_array(points.T)
+        x = to_array(rng.uniform(DOMAIN_LOWER, DOMAIN_UPPER, (_CHANGE_POINTS, 3)).T)
         prior = {name: self.scene.avatar.tensors[name] for name in SHAPE_NETWORKS}
         prior |= {name: dr.detach(parameters[name]) for name in (*SHAPE_LATENTS, POSE)}
         return losses.mean(dr.abs(deform(shape, x)[0] - deform(self._field(prior), x)[0]))
@@ -290,5 +290,5 @@ class LatentProblem(GeometryProblem):
 
 def _inverse(motion: Any) -> Any:
     """[3, 4] matrix (Rᵀ | −Rᵀ t) of a rigid motion (R | t)."""
-    turned = dr.concat([dr.reshape(motion[:, k : k + 1], (1, 3)) for k in range(3)], axis=0)
+    turned: Any = dr.concat([dr.reshape(motion[:, k : k + 1], (1, 3)) for k in range(3)], axis=0)
     return dr.concat([turned, -(turned @ motion[:, 3:4])], axis=1)

@@ -36,12 +36,12 @@ SECOND_LIGHT = np.array(
 
 def render_layers(scene: mi.Scene) -> dict[str, np.ndarray]:
     """All layers of an `avatar_scene`: [H, W, 3], one-channel ones [H, W]."""
-    return split_layers(mi.render(scene, spp=_SAMPLES, seed=0).numpy())
+    return split_layers(mi.render(scene, spp=_SAMPLES, seed=mi.UInt32(0)).numpy())
 
 
 def render_radiance(scene: mi.Scene) -> np.ndarray:
     """The radiance [H, W, 3] of an `avatar_scene`, with or without its extra channels."""
-    return mi.render(scene, spp=_SAMPLES, seed=0).numpy()[..., :3]
+    return mi.render(scene, spp=_SAMPLES, seed=mi.UInt32(0)).numpy()[..., :3]
 
 
 def avatar_scene(
@@ -82,7 +82,9 @@ def _tile(image: np.ndarray) -> np.ndarray:
     scale = _TILE / max(image.shape[:2])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     canvas = Image.new("RGB", (_TILE, _TILE))
-    canvas.paste(Image.fromarray(pixels).resize(size, Image.LANCZOS), ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2))
+    canvas.paste(
+        Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS), ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2)
+    )
     return np.asarray(canvas) / 255
 
 

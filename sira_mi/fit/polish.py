@@ -30,8 +30,8 @@ from sira_mi.fields.sdf import deform
 from sira_mi.fit.appearance import PhotoSurface, share_surface
 from sira_mi.fit.output import head_box
 from sira_mi.fit.refinement import AlbedoRefinementProblem, AlbedoRefinementStage
-from sira_mi.fit.shaded import decode_lobes, decoder
-from sira_mi.fit.stage import Arrays, FitTask, Problem
+from sira_mi.fit.shaded import Arrays, decode_lobes, decoder
+from sira_mi.fit.stage import FitTask, Problem
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import psnr_inside
@@ -123,7 +123,7 @@ class PolishProblem(AlbedoRefinementProblem):
         evaluated up to half a voxel off the vertices, at random, so that a vertex stands for its surroundings."""
         a = self.avatar.architecture
         shaken = self.x_ref + rng.uniform(-self.jitter, self.jitter, self.x_ref.shape)
-        x_ref, gamma = mi.TensorXf(shaken.astype(np.float32)), mi.TensorXf(self.gamma)
+        x_ref, gamma = to_array(shaken), to_array(self.gamma)
         base = diffuse_albedo(decoder(self.avatar, "diffuse_albedo", current, "z_a"), a.albedo_octaves, x_ref, gamma)
         fine = albedo_refinement(decoder(self.avatar, "albedo_refinement", current), a.refinement_octaves, x_ref, gamma)
         specular = decoder(self.avatar, "specular_albedo", current, "z_s")
@@ -156,7 +156,7 @@ class PolishProblem(AlbedoRefinementProblem):
             spp=samples,
             spp_grad=samples,
             seed=mi.UInt32(seed),
-            seed_grad=mi.UInt32(seed_of_derivative),
+            seed_grad=seed_of_derivative,
         )
         error = image[:, :, :3] * mi.TensorXf(self.detail) - mi.TensorXf(self.target)
         loss = dr.sum(error * error * self.weight, axis=None)

@@ -1,4 +1,4 @@
-"""Which pixels a geometry step looks at: evenly spaced grids over a window of the photo, shifted at random."""
+"""The pixels of a geometry step: an evenly spaced grid over a window of the photo, shifted at random."""
 
 from dataclasses import dataclass
 

@@ -16,8 +16,8 @@ from sira_mi.fields.columns import to_array
 from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fit.appearance import AppearanceProblem, AppearanceStage, AppearanceWeights, share_surface
 from sira_mi.fit.residual import albedo_shares, light_variances, log_residual, share_loss
-from sira_mi.fit.shaded import PhotoPoints, Shading, decoder, shade_points
-from sira_mi.fit.stage import Arrays, FitTask, Problem
+from sira_mi.fit.shaded import Arrays, PhotoPoints, Shading, decoder, shade_points
+from sira_mi.fit.stage import FitTask, Problem
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
 
@@ -104,7 +104,7 @@ class AlbedoRefinementProblem(AppearanceProblem):
             "color": losses.photometric_loss(radiance, target),
             **self._prior_losses(points.current, points.shading, points.skin_tone),
         }
-        moved = points.x_ref + mi.TensorXf((_JITTER * rng.standard_normal((3, len(points.index)))).astype(np.float32))
+        moved = points.x_ref + to_array(_JITTER * rng.standard_normal((3, len(points.index))))
         octaves = self.avatar.architecture.refinement_octaves
         beside = albedo_refinement(points.network, octaves, moved, points.gamma)
         smoothness = losses.smoothness_loss(points.fine, beside)

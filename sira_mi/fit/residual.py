@@ -1,19 +1,21 @@
-"""What base albedo, light and shape leave of a photo, shared between albedo and light. The paper gives all of it to the
-albedo (eq. 11).
+"""How the residual of a photo is shared between albedo and light: the part that eq. 8 with the base albedo does not
+explain. The paper gives all of it to the albedo (eq. 11).
 
-Seen as logarithms, the residual at a point is the sum of two deviations: of the person's albedo from the prior's, and
-of the light that arrives from eq. 8's. Of independent normal deviations the most probable parts are in proportion to
-their variances, so that each gets a share. How far the light may deviate, the fit itself says: by how much eq. 8 would
-change were the normal as wrong as fitted normals are, and the shadows as far away as fitted surfaces are. That is
-little in soft light and much where hard light grazes or a shadow ends. The albedo deviates by what the priors leave of
-unseen heads, more at eyes, brows and lips; and where the residuals are larger than light and this can explain, as on
-photos of people, hair and clothes that no training head is like, by all that is left.
+As logarithms, the residual at a point is the sum of two deviations: of the person's albedo from the prior's, and of the
+incident light from eq. 8's. If the deviations are independent and normal, the most probable parts are in proportion to
+their variances; this gives each its share.
+
+The variance of the light is computed: how much eq. 8 changes when normals tilt as much as fitted normals err, and
+shadows shift as far as fitted surfaces err. It is small in soft light, and large where hard light grazes the surface or
+a shadow ends. The variance of the albedo is what the priors leave unexplained on unseen heads, larger at eyes, brows
+and lips. It is raised where residuals exceed what both explain, as on hair and clothes that no training head has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -27,25 +29,25 @@ from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import BROWS, EYES, LIPS, MOUTH
 from sira_mi.portrait.portrait import Portrait
 
-# Added to radiances and albedos that logarithms are taken of.
+# Added to radiances and albedos before their logarithm.
 _DARK_RADIANCE, _DARK_ALBEDO = 0.01, 0.02
 # Deviations of the log albedo from the prior's, grey and colour: of skin, hair and cloth; near brows, lips and eyes; in
 # the openings of eyes and mouth.
 _COMMON, _FEATURES, _OPENINGS = (0.1, 0.06), (0.15, 0.1), (0.4, 0.15)
-# How wrong a fit's surface is: normals, degrees (root mean square), and places, scene units.
+# Error of a fit's surface: normals, degrees (root mean square), and positions, scene units.
 _TILT, _SHIFT = 15.0, 0.08
-# Times that the light is computed on wrong surfaces.
+# Perturbed surfaces on which the light is computed.
 _TRIALS = 6
-# No light is known better than this, grey and colour.
+# Least deviation of the log light, grey and colour.
 _LEAST_LIGHT = (0.03, 0.02)
-# Points whose deviations of the light are averaged.
+# Neighbouring points over which variances of the light are averaged.
 _NEIGHBOURS = 8
 # Median over mean of the square of a normal deviation in one dimension, grey, and in two, colour.
 _MEDIAN = np.array([0.4549, np.log(2)])
 
 
 def log_residual(radiance: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Logarithm [3, N] of a radiance over the expected one, both [3, N]; darkness counts little."""
+    """Logarithm [3, N] of a radiance over the expected one, both [3, N]; an offset keeps dark points small."""
     return np.log((np.maximum(radiance, 0) + _DARK_RADIANCE) / (expected + _DARK_RADIANCE))
 
 
@@ -60,8 +62,8 @@ def light_variances(
     radiance: Callable[[PhotoPoints], np.ndarray], points: PhotoPoints, chosen: np.ndarray, seed: int
 ) -> np.ndarray:
     """Variances [2, N] (grey, colour) of the log light at all `points`, from its changes at the `chosen` ones when
-    normals tilt and shadows shift. `radiance` gives eq. 8 [3, n] at the chosen points, whose normals and visibility may
-    be others."""
+    normals tilt and shadows shift. `radiance` evaluates eq. 8 [3, n] at the chosen points with other normals and
+    visibility."""
     rng = np.random.default_rng(seed)
     place = (points.origin + points.t * points.view).T
     everywhere = cKDTree(place)
@@ -105,8 +107,8 @@ def albedo_variances(portrait: Portrait, row: np.ndarray, column: np.ndarray) ->
 def albedo_shares(residual: np.ndarray, chosen: np.ndarray, albedo: np.ndarray, light: np.ndarray) -> np.ndarray:
     """Shares [2, N] (grey, colour), 0 to 1, of a residual that are the albedo's: by the variances of `albedo` and
     `light` [2, N], the former raised to what the `residual` [3, n] at the points `chosen` has beyond the latter.
-    Medians tell how large residuals are, so that a tie that the prior paints in another colour does not count for all
-    of the photo."""
+    The size of residuals is their median, so that clothes in a colour that the prior does not expect do not raise the
+    albedo's share all over the photo."""
     whole = np.median(squares(residual), axis=1) / _MEDIAN
     beyond = np.maximum(whole - np.median(light[:, chosen], axis=1), 0)
     albedo = np.maximum(albedo, beyond[:, None])
@@ -123,5 +125,5 @@ def share_loss(base, albedo, light_refinement, shares: np.ndarray):
 def _scaled(residual, shares: np.ndarray):
     """A residual [3, N] with its grey and its colour times their `shares` [2, N]."""
     of_grey, of_colour = (to_array(row[None]) for row in shares)
-    grey = dr.reshape(dr.mean(residual, axis=0), (1, -1))
+    grey: Any = dr.reshape(dr.mean(residual, axis=0), (1, -1))
     return in_three(grey * (of_grey - of_colour)) + residual * in_three(of_colour)

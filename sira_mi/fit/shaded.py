@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -23,12 +23,14 @@ from sira_mi.sg.visibility import SHADOW_OFFSET, even_directions, light_visibili
 # Directions in which the points' visibility is traced.
 DIRECTIONS = 128
 
-Points = TypeVar("Points", bound="SeenPoints")
+# Dr.Jit arrays and tensors by name. Their classes belong to the variant, so that no static type names them.
+Arrays = dict[str, Any]
+Points = TypeVar("Points", bound="SurfacePoints")
 
 
 @dataclass(frozen=True)
-class SeenPoints:
-    """Surface points at a camera's pixel centres that show the head, N columns."""
+class SurfacePoints:
+    """The points of a head at a camera's pixel centres, N columns."""
 
     row: np.ndarray  # [N]
     column: np.ndarray  # [N]
@@ -44,13 +46,13 @@ class SeenPoints:
 
 
 @dataclass(frozen=True)
-class PhotoPoints(SeenPoints):
-    """Those inside a photo's mask."""
+class PhotoPoints(SurfacePoints):
+    """The points inside a photo's mask."""
 
     unoccluded: np.ndarray  # [K, N] bool: whether nothing blocks each of `even_directions(DIRECTIONS)`
 
 
-def seen_points(camera: Camera, head) -> SeenPoints:
+def find_surface_points(camera: Camera, head) -> SurfacePoints:
     """The points of a `neural_sdf` that a camera sees."""
     from sira_mi.plugins.neural_sdf import trace_head  # exists only under a variant
 
@@ -67,18 +69,18 @@ def seen_points(camera: Camera, head) -> SeenPoints:
     x = origin + t * view
     _, gradient, x_ref, gamma = evaluate_in_chunks(lambda p: surface(field, p), x)
     normal = unit_columns(gradient).astype(np.float32)
-    return SeenPoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
+    return SurfacePoints(chosen // camera.width, chosen % camera.width, origin, view, t, x_ref, gamma, normal)
 
 
-def masked_points(portrait: Portrait, head) -> SeenPoints:
+def find_masked_points(portrait: Portrait, head) -> SurfacePoints:
     """The points of a `neural_sdf` that the portrait shows inside its mask."""
-    seen = seen_points(portrait.camera, head)
+    seen = find_surface_points(portrait.camera, head)
     return seen[np.flatnonzero(portrait.mask[seen.row, seen.column] > 0.5)]
 
 
-def photo_points(portrait: Portrait, head) -> PhotoPoints:
+def find_photo_points(portrait: Portrait, head) -> PhotoPoints:
     """The points of a `neural_sdf` that the portrait shows inside its mask, and their visibility."""
-    seen = masked_points(portrait, head)
+    seen = find_masked_points(portrait, head)
     scene = mi.load_dict({"type": "scene", "head": head})
     place = seen.origin + seen.t * seen.view
     axes = even_directions(DIRECTIONS).axis
@@ -86,36 +88,39 @@ def photo_points(portrait: Portrait, head) -> PhotoPoints:
     return PhotoPoints(**vars(seen), unoccluded=unoccluded)
 
 
-def decoder(avatar: Avatar, name: str, tensors: dict, latent: str | None = None) -> list[tuple]:
-    """Layers of the network `name` at `tensors` (Floats)."""
-    return layers(avatar.architecture.networks[name], tensors[name], None if latent is None else tensors[latent])
+def decoder(avatar: Avatar, name: str, parameters: Arrays, latent: str | None = None) -> list[tuple]:
+    """Layers of the network `name` at `parameters` (Floats)."""
+    z = None if latent is None else parameters[latent]
+    return layers(avatar.architecture.networks[name], parameters[name], z)
 
 
-def decode_lobes(avatar: Avatar, tensors: dict):
-    """The light [N_l, 7] of the illumination decoder at `tensors` (Floats)."""
-    z_l = mi.TensorXf(tensors["z_l"], (len(tensors["z_l"]), 1))
-    return illumination(decoder(avatar, "illumination", tensors), z_l)[:, :, 0]
+def decode_lobes(avatar: Avatar, parameters: Arrays) -> Any:
+    """The light [N_l, 7] of the illumination decoder at `parameters` (Floats)."""
+    z_l = mi.TensorXf(parameters["z_l"], (len(parameters["z_l"]), 1))
+    return illumination(decoder(avatar, "illumination", parameters), z_l)[:, :, 0]
 
 
 @dataclass(frozen=True)
 class Shading:
-    """Eq. 8 at some points: what the losses look at. Tensors."""
+    """Light and radiance of eq. 8 at some points, tensors."""
 
     lobes: mi.TensorXf  # [N_l, 7]
     diffuse: mi.TensorXf  # [3, N] radiance
     specular: mi.TensorXf  # [3, N] radiance, times k_s
 
 
-def shade_points(avatar: Avatar, tensors: dict, k_s: float | None, points: PhotoPoints, albedo, normal=None) -> Shading:
-    """Light and radiance at `points` of diffuse `albedo` [3, N] by the decoders at `tensors` (Floats); `normal` [3, N],
-    a tensor, may stand in for the points' own. Shadows are those of the `sira_sg` integrator. With `k_s` None the
+def shade_points(
+    avatar: Avatar, parameters: Arrays, k_s: float | None, points: PhotoPoints, albedo, normal=None
+) -> Shading:
+    """Light and radiance at `points` of diffuse `albedo` [3, N], by the decoders at `parameters` (Floats); a tensor
+    `normal` [3, N] replaces the points' own. Shadows are those of the `sira_sg` integrator. With `k_s` None the
     specular term is left out, and 0."""
     view = mi.TensorXf(points.view)
     normal = mi.TensorXf(points.normal) if normal is None else normal
-    lobes = decode_lobes(avatar, tensors)
+    lobes = decode_lobes(avatar, parameters)
     specular = None
     if k_s is not None:
-        network, octaves = decoder(avatar, "specular_albedo", tensors, "z_s"), avatar.architecture.specular_octaves
+        network, octaves = decoder(avatar, "specular_albedo", parameters, "z_s"), avatar.architecture.specular_octaves
         specular = specular_albedo(network, octaves, mi.TensorXf(points.x_ref))
     unoccluded, directions = mi.TensorXf(points.unoccluded.astype(np.float32)), even_directions(DIRECTIONS)
     visibility = light_visibility(normal, view, specular, avatar.roughness, lobes, directions, unoccluded)
@@ -123,8 +128,8 @@ def shade_points(avatar: Avatar, tensors: dict, k_s: float | None, points: Photo
     return Shading(lobes, *closed_form_radiance(normal, view, material, lobes, visibility))
 
 
-def base_albedo(avatar: Avatar, tensors: dict, points: SeenPoints):
-    """Base diffuse albedo [3, N] of points, by the decoders at `tensors` (Floats)."""
-    network = decoder(avatar, "diffuse_albedo", tensors, "z_a")
+def base_albedo(avatar: Avatar, parameters: Arrays, points: SurfacePoints) -> Any:
+    """Base diffuse albedo [3, N] of points, by the decoders at `parameters` (Floats)."""
+    network = decoder(avatar, "diffuse_albedo", parameters, "z_a")
     octaves = avatar.architecture.albedo_octaves
     return diffuse_albedo(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma))

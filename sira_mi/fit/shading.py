@@ -18,8 +18,8 @@ from sira_mi.fields.columns import normalise
 from sira_mi.fields.sdf import SdfField, surface
 from sira_mi.fields.tracing import differentiable_hit
 from sira_mi.fit.geometry import GeometryProblem, GeometryScene, GeometryStage
-from sira_mi.fit.shaded import decoder, shade_points
-from sira_mi.fit.stage import Arrays, FitTask, Problem
+from sira_mi.fit.shaded import Arrays, decoder, shade_points
+from sira_mi.fit.stage import FitTask, Problem
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
 from sira_mi.portrait.portrait import halve

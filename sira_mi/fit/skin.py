@@ -1,16 +1,16 @@
-"""The bare facial skin of a photo: it tells how the photo is exposed, and settles the level of the light against the
-albedo's.
+"""The bare facial skin of a photo. It gives the photo's exposure, and separates the brightness of the light from that
+of the albedo.
 
-How light skin is and how bright the light on it, a photo tells by two cues: how bright the skin is in it (photos are
-exposed for the light in part only), and how bright it is against the white of the eyes, which differs little between
-people and is lit like the skin below it. Some eyes mislead: they lie in the shadow of the brow, or a light catches them
-that the cheek does not see; more often the one that is darker than the other. Each eye counts as the reading of a gauge
-that may be broken."""
+Two cues separate them: how bright the skin is in the photo, as exposure makes up for the light only in part; and the
+contrast between skin and the white of the eyes, which differs little between people and is lit like the skin below it.
+Some eyes mislead, more often the darker one of the two: they lie in the shadow of the brow, or catch a light that the
+cheek does not. So each eye is modelled as a measurement that is an outlier with some probability."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,29 +20,29 @@ from skimage.draw import polygon2mask
 
 from sira_mi.avatar.file import Avatar
 from sira_mi.conventions import LUMINANCE
-from sira_mi.fit.shaded import SeenPoints, base_albedo
+from sira_mi.fit.shaded import SurfacePoints, base_albedo
 from sira_mi.portrait.landmarks import BARE_SKIN, BELOW_EYES, EYES
 from sira_mi.portrait.portrait import Portrait
 
-# Pixels this near to a landmark of bare skin tell how bright the skin is in the photo, shares of the face's height.
-_REACH = 0.04
-# Luminance below this counts as this.
+# Radius around a landmark of bare skin in which pixels count as skin, share of the face's height.
+_RADIUS = 0.04
+# Least luminance.
 _DARKEST = 1e-3
-# Photos are scaled by no less and no more than this for the learned radiance.
+# Range of the exposure.
 _EXPOSURES = (0.5, 16.0)
-# The white of an eye is as bright as the brightest tenth of its opening, percent.
+# Percentile of an eye's opening that is its white.
 _WHITE = 90
-# Skin is neither darker nor lighter, L* 30 to 73.
+# Luminances between which skin lies, L* 30 to 73.
 _SKIN = (0.06, 0.45)
-# Contrasts beyond these count as these, and those that mislead lie anywhere between.
+# Range of contrasts; larger ones are clipped, outliers are uniform in it.
 _CONTRASTS = (-1.9, 0.05)
-# Values of y that are weighed against each other.
+# Values of y at which its distribution is evaluated.
 _LEVELS = 161
 
 
 @dataclass(frozen=True)
 class Eye:
-    """What an eye tells of the skin below it."""
+    """The cue of one eye."""
 
     contrast: float  # log of the skin's luminance over that of the eye's white
     white: float  # log luminance of the white
@@ -50,18 +50,18 @@ class Eye:
 
 @dataclass(frozen=True)
 class SkinCues:
-    """What a photo tells of its skin."""
+    """The cues of a photo."""
 
     radiance: float  # luminance of the skin, geometric mean
-    eyes: tuple[Eye, ...]  # those seen
+    eyes: tuple[Eye, ...]  # the visible ones
 
 
 @dataclass(frozen=True)
 class SkinLevel:
-    """How the cues of a photo follow from y, the log luminance of its skin's albedo: y is normal about usual +
-    by_radiance · log radiance, the contrast of an eye about y − white, and with odds of exp(misleading + darker · the
-    log of the brighter eye's white over its own) it is anything. The values are those of `python -m studies.portraits
-    skin` on portraits of training heads."""
+    """The distribution of y, the log luminance of the skin's albedo, and of the cues given y. y is normal about usual +
+    by_radiance · log radiance; the contrast of an eye is normal about y − white, or an outlier, with odds of
+    exp(misleading + darker · log of the brighter eye's white over its own). The values are fitted on portraits of
+    training heads by `python -m studies.portraits skin`."""
 
     usual: float = -1.38
     by_radiance: float = 0.25
@@ -74,45 +74,46 @@ class SkinLevel:
     def log_luminance(self, radiance: np.ndarray, contrast: np.ndarray, white: np.ndarray) -> np.ndarray:
         """The mean of y [N] given the log radiance of skin [N] and of two eyes their contrasts and log luminances
         [N, 2], NaN where an eye is not seen."""
-        y = np.linspace(*np.log(_SKIN), _LEVELS)
+        darkest, lightest = np.log(_SKIN)
+        y = np.linspace(darkest, lightest, _LEVELS)
         expected = self.usual + self.by_radiance * radiance[:, None]
         log_odds = -(((y - expected) / self.spread) ** 2) / 2
         brighter = np.fmax(white[:, 0], white[:, 1])
         for eye in range(2):
             reading = np.clip(contrast[:, eye : eye + 1], *_CONTRASTS)
             shift = (reading - (y - self.white)) / self.deviation
-            right = np.exp(-(shift**2) / 2) / (self.deviation * np.sqrt(2 * np.pi))
-            share = expit(self.misleading + self.darker * (brighter - white[:, eye]))[:, None]
+            inlier = np.exp(-(shift**2) / 2) / (self.deviation * np.sqrt(2 * np.pi))
+            outliers = expit(self.misleading + self.darker * (brighter - white[:, eye]))[:, None]
             seen = np.isfinite(reading)
-            either = (1 - share) * right + share / np.ptp(_CONTRASTS)
-            log_odds = log_odds + np.log(either, where=seen, out=np.zeros_like(either))
+            density = (1 - outliers) * inlier + outliers / np.ptp(_CONTRASTS)
+            log_odds = log_odds + np.log(density, where=seen, out=np.zeros_like(density))
         weights = softmax(log_odds, axis=1)
         return weights @ y
 
 
 def skin_cues(portrait: Portrait) -> SkinCues | None:
-    """What a photo tells of its skin; None where no skin is seen."""
+    """The cues of a photo; None where no skin is visible."""
     luminance = _luminance_near(portrait, BARE_SKIN)
     return SkinCues(float(np.exp(np.log(luminance).mean())), _eyes(portrait)) if len(luminance) else None
 
 
 def near_landmarks(landmarks: np.ndarray, chosen: tuple[int, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels of a `mask` [H, W] that are near to the `chosen` ones of landmarks [468, 2], in
-    pixels, NaN where unknown."""
+    """Rows and columns of the pixels of a `mask` [H, W] within `landmark_radius` of the `chosen` ones of landmarks
+    [468, 2], pixels, NaN where unknown."""
     row, column = np.nonzero(mask)
     wanted = landmarks[list(chosen)]
     wanted = wanted[np.isfinite(wanted).all(axis=1)]
     if not len(wanted) or not len(row):
         return row[:0], column[:0]
-    found = cKDTree(np.stack([column, row], axis=1) + 0.5).query_ball_point(wanted, reach(landmarks))
+    found = cKDTree(np.stack([column, row], axis=1) + 0.5).query_ball_point(wanted, landmark_radius(landmarks))
     near = np.unique(np.concatenate(found).astype(int))
     return row[near], column[near]
 
 
-def reach(landmarks: np.ndarray) -> float:
-    """How near to a landmark of [468, 2] the skin is sure to be as it is there, pixels."""
+def landmark_radius(landmarks: np.ndarray) -> float:
+    """Radius, pixels, around each of landmarks [468, 2] in which skin looks as it does there."""
     known = landmarks[np.isfinite(landmarks[:, 1]), 1]
-    return _REACH * float(np.ptp(known)) if len(known) else 0.0
+    return _RADIUS * float(np.ptp(known)) if len(known) else 0.0
 
 
 def _luminance_near(portrait: Portrait, chosen: tuple[int, ...]) -> np.ndarray:
@@ -121,7 +122,7 @@ def _luminance_near(portrait: Portrait, chosen: tuple[int, ...]) -> np.ndarray:
 
 
 def _eyes(portrait: Portrait) -> tuple[Eye, ...]:
-    """The eyes whose white and skin below are seen."""
+    """The eyes of which white and skin below are visible."""
     seen = []
     for opening, below in zip(EYES, BELOW_EYES, strict=True):
         outline, skin = portrait.landmarks[list(opening)], _luminance_near(portrait, below)
@@ -137,7 +138,7 @@ def _eyes(portrait: Portrait) -> tuple[Eye, ...]:
 
 def face_exposure(portrait: Portrait, prior: Avatar) -> float:
     """The factor that brings the skin of a photo to the luminance that skin has in the photos of the prior's training;
-    1 where no skin is seen."""
+    1 where no skin is visible."""
     cues = skin_cues(portrait)
     return 1.0 if cues is None else float(np.clip(prior.skin_prior().radiance / cues.radiance, *_EXPOSURES))
 
@@ -157,12 +158,12 @@ def cue_arrays(cues: Sequence[SkinCues]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class SkinPatches:
-    """Points of bare facial skin, one a landmark, and the luminance of the albedo that is expected there."""
+    """Points of bare facial skin, one for each landmark, and the luminance of the albedo that is expected there."""
 
-    points: SeenPoints
+    points: SurfacePoints
     luminance: float
 
-    def loss(self, avatar: Avatar, tensors: dict):
+    def loss(self, avatar: Avatar, tensors: dict) -> Any:
         """`SkinPrior.loss` of the base diffuse albedo by the decoders at `tensors` (Floats)."""
         count = len(self.points.row)
         albedo = base_albedo(avatar, tensors, self.points)
@@ -171,13 +172,13 @@ class SkinPatches:
         return skin.loss(albedo, weight, skin.tone_of_luminance(np.array([self.luminance])))
 
 
-def skin_patches(portrait: Portrait, points: SeenPoints) -> SkinPatches | None:
-    """The points nearest to the photo's landmarks of bare skin; None without a face or where none is seen."""
+def skin_patches(portrait: Portrait, points: SurfacePoints) -> SkinPatches | None:
+    """The points nearest to the photo's landmarks of bare skin; None without a face or where none is visible."""
     cues = skin_cues(portrait)
     if cues is None or not len(points.row):
         return None
     landmarks = portrait.landmarks[list(BARE_SKIN)]
     tree = cKDTree(np.stack([points.column, points.row], axis=1) + 0.5)
     distance, nearest = tree.query(landmarks[np.isfinite(landmarks).all(axis=1)])
-    close = distance < reach(portrait.landmarks)
+    close = distance < landmark_radius(portrait.landmarks)
     return SkinPatches(points[nearest[close]], skin_luminance(cues)) if close.any() else None

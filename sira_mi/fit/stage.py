@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -15,14 +15,12 @@ import numpy as np
 from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.decisions import Decision, Plan
 from sira_mi.fields.sdf import rigid_motion
-from sira_mi.fit.shaded import PhotoPoints, photo_points
+from sira_mi.fit.shaded import Arrays, PhotoPoints, find_photo_points
 from sira_mi.fit.skin import face_exposure
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
 
-# Dr.Jit arrays and tensors by name. Their classes belong to the variant, so that no static type names them.
-Arrays = dict[str, Any]
 Shared = TypeVar("Shared")
 
 
@@ -115,7 +113,7 @@ class FitTask:
 
     def photo_points(self, portrait: Portrait, head) -> PhotoPoints:
         """The points of a `neural_sdf` that `portrait` shows, and their visibility."""
-        return photo_points(portrait, head)
+        return find_photo_points(portrait, head)
 
     def pose_portrait(self, state: FitState) -> Portrait:
         """The portrait, its camera moved so that it sees the head unmoved."""

@@ -19,7 +19,7 @@ from sira_mi.files import write_through
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress
 from sira_mi.fit.fit import assemble_avatar, fit_portrait
-from sira_mi.fit.shaded import seen_points
+from sira_mi.fit.shaded import find_surface_points
 from sira_mi.fit.stage import FitSettings
 from sira_mi.fit.state import FitState, initial_state
 from sira_mi.optimisation.adam import read_arrays, write_arrays
@@ -91,7 +91,7 @@ def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settin
 
 def _geometry_pictures(camera: Camera, head) -> dict[str, np.ndarray]:
     """Normals [H, W, 3] and mask [H, W] at the pixel centres."""
-    seen = seen_points(camera, head)
+    seen = find_surface_points(camera, head)
     mask = np.zeros((camera.height, camera.width), np.float32)
     normal = np.zeros((*mask.shape, 3), np.float32)
     mask[seen.row, seen.column] = 1

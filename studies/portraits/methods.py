@@ -18,7 +18,7 @@ from sira_mi.fit.appearance import AppearanceStage
 from sira_mi.fit.geometry import GeometryStage
 from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
 from sira_mi.fit.settings import add_shading, polish_stage
-from sira_mi.fit.shaded import DIRECTIONS, PhotoPoints, masked_points
+from sira_mi.fit.shaded import DIRECTIONS, PhotoPoints, find_masked_points
 from sira_mi.fit.shading import ShadingStage
 from sira_mi.fit.stage import FitSettings, FitTask, Stage
 from sira_mi.fit.state import FitState
@@ -42,7 +42,7 @@ class UnshadowedTask(FitTask):
     """A fit in which nothing blocks the light."""
 
     def photo_points(self, portrait: Portrait, head) -> PhotoPoints:
-        seen = masked_points(portrait, head)
+        seen = find_masked_points(portrait, head)
         return PhotoPoints(**vars(seen), unoccluded=np.ones((DIRECTIONS, len(seen.row)), bool))
 
 
