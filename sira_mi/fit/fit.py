@@ -1,6 +1,5 @@
 """A whole fit: photo -> portrait -> geometry -> appearance -> avatar folder."""
 
-import contextlib
 import hashlib
 import json
 import sys
@@ -20,7 +19,6 @@ from sira_mi.avatar.file import PRIOR, Avatar, load_prior, save_avatar
 from sira_mi.decisions import explain
 from sira_mi.errors import InputError
 from sira_mi.export.mesh import write_mesh
-from sira_mi.export.scene import orbit
 from sira_mi.export.scene_file import write_scene
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.fit import output
@@ -33,7 +31,6 @@ from sira_mi.fit.settings import QUALITIES, polish_stage
 from sira_mi.fit.shaded import decode_lobes
 from sira_mi.fit.stage import FitSettings, FitTask
 from sira_mi.fit.state import initial_state
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 from sira_mi.relight.pictures import preview, psnr_inside
 from sira_mi.sg.fit_environment import render_environment
@@ -214,36 +211,29 @@ def assemble_avatar(prior: Avatar, progress: Progress, settings: FitSettings) ->
     return replace(prior.with_tensors(**parameters, lobes=lobes), k_s=reached.k_s[1], k_r=reached.k_r)
 
 
-def write_folder(out: Path, portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float) -> None:
-    """Writes everything that a fit leaves behind."""
+def write_folder(
+    out: Path, portrait: Portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float
+) -> None:
+    """Completes the report and writes everything that a fit leaves behind. The camera of `portrait` sees the head
+    unmoved."""
     begun = time.monotonic()
     avatar_path = out / "avatar.safetensors"
     save_avatar(avatar_path, avatar)
     lobes = avatar.tensors["lobes"]
     write_lights(out / "lights.json", lobes)
     write_exr(out / "lights.exr", render_environment(lobes, 128))
-    write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
     write_scene(out / "scene.xml", portrait.camera)
 
     scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
-    layers = output.render_layers(scene)
-    with contextlib.suppress(FileExistsError):
-        (out / "renders").mkdir()
-    output.write_renders(out / "renders", layers)
     write_mesh(out / "mesh.ply", scene.shapes()[0])
-
-    box = output.head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
-    close = output.box_camera(portrait.camera, box)
-    turned = []
-    for yaw in (-30, 30):
-        camera = orbit(close, yaw)
-        view = output.avatar_scene(str(avatar_path), camera, output.SECOND_LIGHT, settings.voxel, extra_channels=False)
-        turned.append(linear_to_srgb(output.render_radiance(view)))
-    write_png(out / "contact.png", output.contact_sheet(portrait.image, portrait.mask, layers, turned, box))
+    layers = output.render_layers(scene)
+    output.write_renders(out / "renders", layers)
+    write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
+    write_png(out / "contact.png", output.contact_sheet(str(avatar_path), portrait, layers, settings.voxel))
 
     inside = portrait.mask * (layers["mask"] > 0.99)
-    report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
     eq_8 = layers["diffuse"] + layers["specular"]
+    report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
     report["psnr_of_unrefined_light_db"] = round(psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
     report["seconds"]["output"] = round(time.monotonic() - begun, 2)

@@ -4,6 +4,7 @@ Everything is written into one folder by functions that write under a temporary 
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -11,10 +12,11 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from sira_mi.export.scene import head, head_scene, sensor, sg_light
+from sira_mi.export.scene import head, head_scene, orbit, sensor, sg_light
 from sira_mi.files import write_exr, write_png, write_through
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import preview
 from sira_mi.sg.layers import split_layers
 
@@ -62,7 +64,9 @@ def avatar_scene(
 
 
 def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
-    """`renders/NAME.exr` with PNG previews, and `renders/mask.png`."""
+    """Makes `folder` and writes `NAME.exr` with PNG previews, and `mask.png`, into it."""
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir()
     for name, image in layers.items():
         if name != "mask":
             write_exr(folder / f"{name}.exr", image)
@@ -82,28 +86,30 @@ def _tile(image: np.ndarray) -> np.ndarray:
     scale = _TILE / max(image.shape[:2])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     canvas = Image.new("RGB", (_TILE, _TILE))
-    canvas.paste(
-        Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS), ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2)
-    )
+    resized = Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
+    canvas.paste(resized, ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2))
     return np.asarray(canvas) / 255
 
 
-def contact_sheet(
-    photo: np.ndarray, mask: np.ndarray, layers: dict, turned: list[np.ndarray], box: tuple
-) -> np.ndarray:
-    """Display values of the sheet: photo, mask, final, normals / diffuse albedo, specular albedo, the head turned both
-    ways under a second light (display values of `box_camera`). `box` (x0, y0, x1, y1) is the part of the photo's frame
-    that is shown."""
+def contact_sheet(avatar_path: str, portrait: Portrait, layers: dict[str, np.ndarray], voxel: float) -> np.ndarray:
+    """Display values of the sheet, cropped to the head: photo, mask, final, normals / diffuse albedo, specular albedo,
+    the head turned both ways under a second light."""
+    box = head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
+    close = box_camera(portrait.camera, box)
+    turned = []
+    for yaw in (-30, 30):
+        scene = avatar_scene(avatar_path, orbit(close, yaw), SECOND_LIGHT, voxel, extra_channels=False)
+        turned.append(linear_to_srgb(render_radiance(scene)))
     x0, y0, x1, y1 = box
     names = ("final", "normal", "diffuse_albedo", "specular_albedo")
     shown = [preview(name, layers[name], layers["mask"]) for name in names]
-    framed = [image[y0:y1, x0:x1] for image in (linear_to_srgb(photo), mask, *shown)]
+    framed = [image[y0:y1, x0:x1] for image in (linear_to_srgb(portrait.image), portrait.mask, *shown)]
     rows = framed[:4], [*framed[4:], *turned]
     return np.concatenate([np.concatenate([_tile(i) for i in row], axis=1) for row in rows], axis=0)
 
 
 def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """The square (x0, y0, x1, y1) of the frame around a mask, with a margin, clipped to the frame."""
+    """The square (x0, y0, x1, y1) around a mask, with a margin, clipped to the frame; the frame for an empty mask."""
     rows, columns = np.nonzero(mask > 0.5)
     height, width = mask.shape
     if len(rows) == 0:
@@ -116,5 +122,5 @@ def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def write_report(path: Path, report: dict) -> None:
-    """`avatar.json`."""
+    """Writes `avatar.json`."""
     write_through(path, lambda p: p.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8"))
