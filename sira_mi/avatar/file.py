@@ -36,8 +36,8 @@ LANDMARK_MODEL = {"landmark_placed", "landmark_directions", "landmark_offsets"}
 class Avatar:
     """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
     architecture (`light_refinement` may be missing); `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light;
-    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown). A prior may hold the
-    tensors of `sira_mi.avatar.landmark_model` too."""
+    `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown). A prior may also hold
+    the tensors of `sira_mi.avatar.landmark_model`."""
 
     architecture: AvatarArchitecture
     tensors: dict[str, np.ndarray]

@@ -1,6 +1,6 @@
 """The shape of a head: how its signed distance field, eqs 1-3, is put together from named parameters.
 
-What a shape consists of is named here and nowhere else. Everything else passes mappings of parameters through.
+What a shape consists of is named here. Plugins, fits and trainings pass mappings of parameters through.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ def scatter_columns(tensor, index, width: int, kind):
 
 
 def in_three(row, axis: int = 0):
-    """A row repeated three times along `axis`. Dr.Jit's own broadcast has an atomic scatter as its adjoint, whose sum
-    of three varies with the order of threads; a concatenation has not."""
+    """A row repeated three times along `axis`. The adjoint of Dr.Jit's own broadcast is an atomic scatter, whose last
+    bits vary with the order of threads; that of a concatenation is not."""
     return dr.concat([row, row, row], axis=axis)
 
 
@@ -72,8 +72,8 @@ def _padded_size(count: int) -> int:
 
 def evaluate_in_chunks(function, *arrays: np.ndarray) -> list[np.ndarray]:
     """Applies `function` (tensors [rows, n] -> tensor or tuple of tensors) to the columns of `arrays` [rows, N],
-    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks come in few sizes, filled up by
-    their last column: a size is part of the kernels, and compiling them takes longer than running them."""
+    `CHUNK` at a time and without gradients; returns NumPy arrays [rows, N]. Chunks are padded with their last column to
+    one of a few sizes, because every new size compiles its own kernels."""
     n = arrays[0].shape[1]
     parts = []
     with dr.suspend_grad():

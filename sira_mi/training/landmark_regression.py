@@ -5,15 +5,13 @@ import numpy as np
 from sira_mi.avatar.file import Avatar
 
 DIRECTIONS = 24  # K
-
-
 _RIDGE = 1.0  # weight of the squared coefficients beside a sum over heads, scene units squared
 
 
 def landmark_tensors(prior: Avatar, placed: np.ndarray, landmarks: np.ndarray) -> dict[str, np.ndarray]:
-    """The tensors of `LandmarkModel`, by ridge regression over heads of the prior whose places [S, 468, 3], as
-    `landmarks_of` has them without a model, and true landmarks [S, 468, 3] are given. What a head does not know counts
-    as the mean head's."""
+    """The tensors of `LandmarkModel`, by ridge regression over S heads of the prior. `placed` [S, 468, 3] are their
+    landmarks by `landmarks_of` without a model, `landmarks` [S, 468, 3] the true ones; those that a head lacks count as
+    the mean head's."""
     known = np.isfinite(prior.tensors["landmarks"]).all(axis=1)
     mean = prior.tensors["landmarks"][known]
     true = landmarks[:, known] - mean
