@@ -43,6 +43,7 @@ def voxel(monkeypatch):
     monkeypatch.setattr(RelightSettings, "__init__", lambda self, **options: default(self, **{"voxel": 0.2, **options}))
 
 
+@pytest.mark.slow
 def test_the_noise_of_path_tracing_is_taken_out(avatar, avatar_path):
     """On a convex blob the closed form is almost exact: its error stays below the noise, which halves with four times
     the samples."""

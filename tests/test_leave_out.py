@@ -346,6 +346,7 @@ def test_a_fit_with_and_without_the_plan_is_the_same(task):
     assert not np.array_equal(results[0].avatar["z_a"], start.avatar["z_a"])
 
 
+@pytest.mark.slow
 def test_a_changed_base_albedo_is_computed_again(task):
     """The base albedo of a stage that holds it is that of the state at hand, also after another stage moved it."""
     stage, index = task.settings.stages[-1], np.arange(10)
