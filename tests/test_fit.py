@@ -1,4 +1,4 @@
-"""The fit as a user runs it: what it leaves behind, resume to the same result, interrupts, bad input."""
+"""The fit as a user runs it: its output folder, resuming to the same result, interrupts, bad input."""
 
 import json
 import os

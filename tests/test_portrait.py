@@ -1,4 +1,4 @@
-"""The portrait front end on a photo: faces, masks, and the whole of it."""
+"""The portrait front end on a photo: faces, masks, and the whole portrait."""
 
 import cv2
 import numpy as np

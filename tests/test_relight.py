@@ -1,4 +1,5 @@
-"""Baked albedos against the networks, the turned head, the closed form against path tracing, and the command."""
+"""Relighting: baked albedos agree with the networks, the closed form with path tracing, the head turns, and the command
+writes its images."""
 
 import json
 import subprocess

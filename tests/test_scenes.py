@@ -1,4 +1,4 @@
-"""The scene files: they open for every integrator, every parameter does what it says, and files are found."""
+"""The scene files: they load for every integrator, every parameter works, and files are found."""
 
 import shutil
 import xml.etree.ElementTree as ET

@@ -1,5 +1,5 @@
-"""Spherical Gaussians: integrals and closed-form shading against quadrature in float64, derivatives against
-differences, and the fit of an environment against its light."""
+"""Spherical Gaussians: integrals and closed-form shading equal quadrature in float64, derivatives equal differences,
+and a fitted environment keeps its light."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 

@@ -1,4 +1,4 @@
-"""The training command and loop: options, descriptions in checkpoints, divergence, log, pictures."""
+"""The training command and loop: options, checkpoints, divergence, log, pictures."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Hits of rays with the field, their derivatives, and how close the others come; against bisection and differences."""
+"""Ray hits with the field, their derivatives, and the closest approach of misses equal bisection and differences."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,4 +1,4 @@
-"""The outline that a fit is drawn to: the photo's own."""
+"""The fitted outline is the photo's: the mask loss has its minimum there, and its derivative is that of its values."""
 
 from dataclasses import replace
 

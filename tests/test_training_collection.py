@@ -1,4 +1,4 @@
-"""The collection: the vendored pack, the surfaces made from it, hair fitting, and the truth stored in a scene."""
+"""The collection: the MakeHuman pack, the surfaces made from it, fitted hair, and the truth stored in a scene."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 

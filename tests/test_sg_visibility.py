@@ -1,5 +1,4 @@
-"""Visibility of lobes: against quadrature under an occluder of known outline, against path tracing, limits,
-derivatives and repeatability."""
+"""Visibility of lobes: quadrature under a known occluder, path tracing, limits, derivatives, repeatability."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 

@@ -1,4 +1,4 @@
-"""Avatar files: what is written comes back, and every kind of damage ends in one clear line."""
+"""Avatar files: a written avatar reads back, and every kind of damage ends in one clear line."""
 
 import dataclasses
 import json

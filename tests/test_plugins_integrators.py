@@ -1,6 +1,6 @@
-"""The integrators `sira_radiance` and `sira_sg`, the camera behind both: channels, derivatives, repeatability, errors.
+"""The integrators `sira_radiance` and `sira_sg` and their camera: channels, derivatives, repeatability, errors.
 
-Pictures are taken through pixel centres and hits are exact, so derivatives are compared without noise."""
+Rays go through pixel centres and hits are exact, so derivatives are compared without noise."""
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +12,7 @@ from scipy.ndimage import binary_erosion
 from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import save_avatar
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
+from sira_mi.errors import InputError
 from sira_mi.export import scene as scenes
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import initial_parameters, layers
@@ -511,3 +512,14 @@ def test_radiance_is_differentiable_by_the_pose_alone(avatar, avatar_path):
     weight = weights(6) * interior(mi.render(scene).numpy()[:, :, 3])[:, :, None]
     weight[:, :, 3:] = 0
     check(scene, "head.pose", weight, change=3e-4, tolerance=3e-3)
+
+
+def test_numbers_of_lobes_are_checked():
+    """`sira_sg` refuses numbers of lobes that the light does not have."""
+    lobes = np.random.default_rng(0).uniform(0.1, 1, (5, 7)).astype(np.float32)
+    for numbers in ([5], [-1], [0, 7]):
+        integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array(numbers, np.float32))})
+        with pytest.raises(InputError, match="numbers of lobes"):
+            integrator.select_lobes(mi.TensorXf(lobes))
+    integrator = mi.load_dict({"type": "sira_sg", "shaded_lobes": mi.TensorXf(np.array([2, 0], np.float32))})
+    np.testing.assert_array_equal(integrator.select_lobes(mi.TensorXf(lobes)).numpy(), lobes[[2, 0]])

@@ -1,4 +1,4 @@
-"""The emitter `sg_envmap` and its files: sampling, derivatives, Mitsuba's own `envmap` as the reference, bad input."""
+"""The emitter `sg_envmap` and its files: sampling, derivatives, agreement with Mitsuba's `envmap`, bad input."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 

@@ -1,4 +1,4 @@
-"""The texture `neural_albedo`: its derivatives, its channels, and its place inside stock BSDFs."""
+"""The texture `neural_albedo`: derivatives, channels, and use inside stock BSDFs."""
 
 import drjit as dr
 import mitsuba as mi

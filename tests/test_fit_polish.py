@@ -1,5 +1,5 @@
-"""The polish: its derivative is that of the path-traced picture, it finds albedo and light again, and a fit with it
-leaves a whole avatar however it ends."""
+"""The polish: its derivative is that of the path-traced picture, it recovers albedo and light, and a fit leaves a whole
+avatar however it ends."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The shading stage: slopes that the photo's light tells."""
+"""The shading stage: the photo's light determines slopes of the surface."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Files of a portrait's truth: read as written, and what is wrong with one is named."""
+"""Files of a portrait's truth read back as written, and errors name what is wrong with one."""
 
 import dataclasses
 

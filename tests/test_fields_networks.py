@@ -1,4 +1,4 @@
-"""Networks: parameters, both modes of evaluation, gradients, appearance decoders; against float64 and differences."""
+"""Networks: parameters, both modes of evaluation, gradients and appearance decoders equal float64 and differences."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,5 +1,5 @@
-"""The evidence for the shape model: distances against analytic ones, fits that recover the model's own heads, the
-landmarks' spread against NumPy, and the whole command on a collection of balls."""
+"""Study of the shape prior: distances equal analytic ones, fits recover the model's own heads, the landmarks' spread
+equals NumPy's, and the command runs on a collection of balls."""
 
 import dataclasses
 import json

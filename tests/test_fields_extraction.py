@@ -1,4 +1,4 @@
-"""The mesh of a field: closed, without slivers, the same coarse to fine as dense."""
+"""The mesh of a field: closed, without slivers, the same from coarse to fine as from a dense grid."""
 
 import numpy as np
 import pytest

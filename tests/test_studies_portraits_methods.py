@@ -1,4 +1,4 @@
-"""The benchmark's methods: what each optimises, that fits are kept and go on from each other."""
+"""The benchmark's methods: what each optimises, and that fits are kept and continue from each other."""
 
 import dataclasses
 import json

@@ -1,5 +1,4 @@
-"""Where a head's landmarks are: the correction of what the network finds in a photo, and of where a prior's field
-places them."""
+"""Landmarks: the correction of those that the network finds in a photo, and their places on a prior's head."""
 
 from dataclasses import replace
 

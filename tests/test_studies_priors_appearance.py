@@ -1,5 +1,5 @@
-"""Evidence for the appearance model: measures against their definitions, latents fitted to a head made by the model
-itself, held-out views, and the parts of the AF-SM's training that this needs, each against a reference."""
+"""Study of the appearance prior: measures equal their definitions, latents fitted to a head of the model recover it,
+held-out views, and the parts of the AF-SM training that the study needs."""
 
 import dataclasses
 import json

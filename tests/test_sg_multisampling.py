@@ -1,4 +1,4 @@
-"""Samples that share a shading: which do, and what `sira_sg` makes of them and of hits on the mesh."""
+"""Samples of a pixel that share one shading: which do, and that `sira_sg` changes little by it."""
 
 import drjit as dr
 import mitsuba as mi

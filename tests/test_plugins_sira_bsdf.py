@@ -1,4 +1,4 @@
-"""The BSDF `sira_bsdf`: sampling, reciprocity, energy, derivatives, and the closed form under the same lights."""
+"""The BSDF `sira_bsdf`: sampling, reciprocity, energy, derivatives, and agreement with the closed form."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 

@@ -1,4 +1,4 @@
-"""What photos tell of the level of their skin's albedo, measured on portraits whose albedo is known."""
+"""The study of the skin's level: what photos say of the albedo, on portraits whose albedo is known."""
 
 import numpy as np
 import pytest

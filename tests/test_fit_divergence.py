@@ -1,4 +1,4 @@
-"""Fits that run away: detected, taken back to the last good block with shorter steps, said, and repeated on resume."""
+"""Fits that diverge: detected, taken back to the last good block with shorter steps, reported, repeated on resume."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 

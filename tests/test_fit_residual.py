@@ -1,5 +1,4 @@
-"""What a photo's residual is shared by: the shares are the best linear estimate, and the loss holds both parts to
-them."""
+"""The shares of a photo's residual are the best linear estimate, and the loss holds albedo and light to them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The skin of a photo: how bright it is, what that says of the skin itself, and that geometry does not depend on it."""
+"""A photo's skin: its brightness, what that says of its albedo, and that the geometry does not depend on it."""
 
 import dataclasses
 

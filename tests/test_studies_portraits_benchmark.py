@@ -1,4 +1,4 @@
-"""The benchmark of portraits: which heads and poses, the truth behind a photo, and the folder."""
+"""The benchmark of portraits: the choice of heads and poses, the truth behind a photo, and the folder."""
 
 import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 

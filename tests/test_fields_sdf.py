@@ -1,4 +1,4 @@
-"""Derivatives of the field: encodings, gradients, motions, the eikonal loss; against differences in float64."""
+"""Derivatives of the field: encodings, gradients, motions and the eikonal loss equal differences in float64."""
 
 import dataclasses
 

@@ -1,6 +1,4 @@
-"""The shape `neural_sdf`: its mesh, the mesh's derivatives in stock integrators, updates, and what it refuses."""
-
-import resource
+"""The shape `neural_sdf`: its mesh, the mesh's derivatives in stock integrators, updates, and errors."""
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +13,7 @@ from sira_mi.export import scene as scenes
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.fields.sdf import signed_distance, surface
+from sira_mi.fit.memory import peak_memory
 
 FIELD = ("z_sdf", "deformation", "reference")
 
@@ -224,7 +223,7 @@ def test_sixty_updates_leave_no_memory_behind(avatar, avatar_path):
         params["head.deformation"] = value
         params.update()
         dr.backward(dr.mean(mi.render(scene, params, spp=1, seed=step)[:, :, :3], axis=None))
-        resident.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)  # MB
+        resident.append(peak_memory() / 2**20)  # MB
     assert resident[-1] - resident[20] < 40
 
 

@@ -1,4 +1,4 @@
-"""Photo files: colour, orientation, profiles, EXIF data, and what is said about bad ones."""
+"""Photo files: colour, orientation, profiles, EXIF data, and errors for bad files."""
 
 import struct
 import zlib

@@ -1,4 +1,4 @@
-"""Scores of pictures: those with known errors, light baked into albedo, values that are no numbers."""
+"""Scores of appearance: pictures with known errors, light baked into the albedo, values that are not numbers."""
 
 import dataclasses
 
