@@ -20,7 +20,7 @@ from sira_mi.errors import InputError
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
 from sira_mi.fit.memory import peak_memory
-from sira_mi.fit.rays import modelled_pixels, pixel_rays
+from sira_mi.fit.rays import find_modelled_pixels, pixel_rays
 from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
@@ -213,7 +213,7 @@ def _camera() -> Camera:
 
 def test_modelled_pixels_leave_out_what_lies_below_the_floor():
     """Rays that cross the domain box and leave it through its floor say nothing about the model."""
-    valid = modelled_pixels(_camera())
+    valid = find_modelled_pixels(_camera())
     origin, direction = pixel_rays(_camera(), *np.meshgrid(np.arange(128), np.arange(96)))
     at_back = origin + direction * ((-2.2 - origin[..., 2:]) / direction[..., 2:])
     assert not valid[at_back[..., 1] < -3.0].any()

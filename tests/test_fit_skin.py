@@ -43,15 +43,15 @@ def darker(portrait: Portrait, factor: float) -> Portrait:
 
 def test_exposure_brings_the_skin_to_that_of_the_training(variant, portrait):
     """Whatever the rest of the photo; bounded, and 1 where no skin is seen."""
-    from sira_mi.fit.skin import face_exposure, skin_cues
+    from sira_mi.fit.skin import face_exposure, find_skin_cues
 
-    assert skin_cues(portrait).radiance == pytest.approx(USUAL, rel=1e-5)
+    assert find_skin_cues(portrait).radiance == pytest.approx(USUAL, rel=1e-5)
     assert face_exposure(darker(portrait, 4), PRIOR_HEAD) == pytest.approx(4, rel=1e-5)
     assert face_exposure(darker(portrait, 0.8), PRIOR_HEAD) == pytest.approx(0.8, rel=1e-5)
     assert face_exposure(darker(portrait, 1e4), PRIOR_HEAD) == 16
     assert face_exposure(darker(portrait, 0.1), PRIOR_HEAD) == 0.5
     for blind in blind_portraits(portrait):
-        assert skin_cues(blind) is None and face_exposure(blind, PRIOR_HEAD) == 1
+        assert find_skin_cues(blind) is None and face_exposure(blind, PRIOR_HEAD) == 1
 
 
 def blind_portraits(portrait: Portrait) -> tuple[Portrait, Portrait]:
@@ -63,24 +63,24 @@ def blind_portraits(portrait: Portrait) -> tuple[Portrait, Portrait]:
 def test_the_white_of_the_eyes_tells_light_from_skin(variant, portrait):
     """The ratio of skin to eyes does not depend on the exposure; where eyes are as bright, skin is light. An eye that
     is not seen does not count; without any, brightness alone tells. Dark glasses do not make skin white."""
-    from sira_mi.fit.skin import Eye, SkinCues, skin_cues, skin_luminance
+    from sira_mi.fit.skin import Eye, SkinCues, find_skin_cues, skin_luminance
 
     landmarks = portrait.landmarks.copy()
     landmarks[list(LEFT_EYE)] = np.nan
     one = dataclasses.replace(portrait, landmarks=landmarks)
     for factor in (1, 4):
-        (eye,) = skin_cues(darker(one, factor)).eyes
+        (eye,) = find_skin_cues(darker(one, factor)).eyes
         assert eye.contrast == pytest.approx(-np.log(2), abs=1e-5)
         assert eye.white == pytest.approx(np.log(2 * USUAL / factor), abs=1e-5)
     eyeless = portrait.landmarks.copy()
     eyeless[[*EYES, *LEFT_EYE]] = np.nan
-    blind = skin_cues(dataclasses.replace(portrait, landmarks=eyeless))
+    blind = find_skin_cues(dataclasses.replace(portrait, landmarks=eyeless))
     assert blind.eyes == () and blind.radiance == pytest.approx(USUAL, rel=1e-5)
     levels = [skin_luminance(SkinCues(0.2, (Eye(contrast, -1),))) for contrast in (-1.5, -0.7, 0.0)]
     assert 0.07 < levels[0] < levels[1] < levels[2] < 0.45
     assert levels[0] < skin_luminance(SkinCues(0.2, ())) < levels[2]
     sunglasses = dataclasses.replace(one, image=np.where(one.image > USUAL * 1.01, 0, one.image))
-    assert skin_luminance(skin_cues(sunglasses)) < 0.45
+    assert skin_luminance(find_skin_cues(sunglasses)) < 0.45
     assert skin_luminance(SkinCues(1e-3, (Eye(-6.0, -1),))) > 0.06
 
 
@@ -102,15 +102,15 @@ def test_an_eye_that_misleads_hardly_counts(variant):
 def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     """The loss is lowest where the albedo at the landmarks has the expected luminance."""
     from sira_mi.fit.shaded import base_albedo, find_masked_points
-    from sira_mi.fit.skin import skin_cues, skin_luminance, skin_patches
+    from sira_mi.fit.skin import find_skin_cues, find_skin_patches, skin_luminance
 
     prior = load_avatar(PRIOR)
     head = mi.load_dict({"type": "neural_sdf", "avatar": str(PRIOR), "voxel": 0.1})
     points = find_masked_points(portrait, head)
     floats = {name: mi.Float(value) for name, value in FitState.of_avatar(prior).avatar.items()}
-    patches = skin_patches(portrait, points)
+    patches = find_skin_patches(portrait, points)
     assert len(patches.points.row) > 6
-    assert patches.luminance == skin_luminance(skin_cues(portrait))
+    assert patches.luminance == skin_luminance(find_skin_cues(portrait))
     shown = float((base_albedo(prior, floats, patches.points).numpy().mean(axis=1) @ np.array(LUMINANCE)).item())
     levels = np.array([0.3, 0.6, 1.0, 1.6, 3.0])
     losses = [
@@ -118,7 +118,7 @@ def test_skin_is_expected_as_light_as_its_cues_say(variant, portrait):
     ]
     assert np.argmin(losses) == 2 and np.all(np.diff(losses[:3]) < 0) and np.all(np.diff(losses[2:]) > 0)
     off = dataclasses.replace(portrait, landmarks=portrait.landmarks + 1000)
-    assert skin_patches(off, points) is None
+    assert find_skin_patches(off, points) is None
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from sira_mi.export import scene as scenes
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.mlp import initial_parameters, layers
 from sira_mi.fields.sdf import deform, signed_distance, surface
-from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
+from sira_mi.fit.rays import Window, find_modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.portrait.camera import Camera
 
 CENTRES = {"type": "stratified", "jitter": False, "sample_count": 1}
@@ -443,7 +443,7 @@ def test_modelled_pixels_are_those_whose_rays_leave_the_box_through_a_wall():
         last = np.where(inside.any(axis=1), inside.shape[1] - 1 - inside[:, ::-1].argmax(axis=1), 0)
         leaving = p[np.arange(40), np.minimum(last + 1, len(t) - 1)]
         expected[row] = inside.any(axis=1) & (leaving[:, 1] > DOMAIN_LOWER[1])
-        np.testing.assert_array_equal(modelled_pixels(lens)[row], expected[row])
+        np.testing.assert_array_equal(find_modelled_pixels(lens)[row], expected[row])
     assert expected.sum() > 0
 
 

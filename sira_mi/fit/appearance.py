@@ -16,7 +16,7 @@ from sira_mi.decisions import Decision
 from sira_mi.fields.columns import evaluate_in_chunks, to_array
 from sira_mi.fit.residual import albedo_variances
 from sira_mi.fit.shaded import Arrays, PhotoPoints, Shading, base_albedo, decoder, shade_points
-from sira_mi.fit.skin import skin_patches
+from sira_mi.fit.skin import find_skin_patches
 from sira_mi.fit.stage import FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
@@ -84,7 +84,7 @@ class PhotoSurface:
         path = str(task.write_avatar(state))
         head = mi.load_dict({"type": "neural_sdf", "avatar": path, "voxel": task.settings.voxel})
         self.points = task.photo_points(self.portrait, head)
-        self.skin = skin_patches(self.portrait, self.points)
+        self.skin = find_skin_patches(self.portrait, self.points)
         row, column = self.points.row, self.points.column
         self.albedo_variances = albedo_variances(self.portrait, row, column)
         self.radiance = np.ascontiguousarray(self.portrait.image[row, column].T, dtype=np.float32)  # [3, N]

@@ -25,8 +25,8 @@ from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.measure import measure_fit
 from sira_mi.fit.memory import peak_memory
-from sira_mi.fit.polish import polish_gain
-from sira_mi.fit.rays import modelled_pixels
+from sira_mi.fit.polish import measure_polish
+from sira_mi.fit.rays import find_modelled_pixels
 from sira_mi.fit.settings import QUALITIES, polish_stage
 from sira_mi.fit.shaded import decode_lobes
 from sira_mi.fit.stage import FitSettings, FitTask
@@ -91,7 +91,7 @@ def fit_photo(request: FitRequest) -> int:
         print(explain(task.plan), file=sys.stderr)
     report["plan"] = task.plan.report()
     if request.polish and complete:
-        report["polish"] = polish_gain(task, polish_stage(), progress.state)
+        report["polish"] = measure_polish(task, polish_stage(), progress.state)
     write_folder(request.out, task.pose_portrait(progress.state), avatar, task.settings, report, started)
     if complete:
         remove_folder(task.folder)
@@ -178,7 +178,7 @@ def read_portrait(request: FitRequest, settings: FitSettings, prior: Avatar) -> 
             camera_path=request.camera,
             face=request.face,
         )
-    if (modelled_pixels(portrait.camera) & (portrait.mask > 0.5)).sum() < _LEAST_PIXELS:
+    if (find_modelled_pixels(portrait.camera) & (portrait.mask > 0.5)).sum() < _LEAST_PIXELS:
         raise InputError("the camera does not see the head inside the mask; check --camera and --mask")
     return portrait
 
@@ -224,12 +224,12 @@ def write_folder(
     write_exr(out / "lights.exr", render_environment(lobes, 128))
     write_scene(out / "scene.xml", portrait.camera)
 
-    scene = output.avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
+    scene = output.load_avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
     write_mesh(out / "mesh.ply", scene.shapes()[0])
     layers = output.render_layers(scene)
     output.write_renders(out / "renders", layers)
     write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
-    write_png(out / "contact.png", output.contact_sheet(str(avatar_path), portrait, layers, settings.voxel))
+    write_png(out / "contact.png", output.draw_contact_sheet(str(avatar_path), portrait, layers, settings.voxel))
 
     inside = portrait.mask * (layers["mask"] > 0.99)
     eq_8 = layers["diffuse"] + layers["specular"]

@@ -21,7 +21,7 @@ from sira_mi.avatar.shape import POSE, SHAPE_LATENTS, SHAPE_NETWORKS, SHAPE_PARA
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER
 from sira_mi.fields.columns import to_array, to_columns
 from sira_mi.fields.sdf import SdfField, deform, surface
-from sira_mi.fit.rays import Window, modelled_pixels, pixel_rays, window_around, window_pixels
+from sira_mi.fit.rays import Window, find_modelled_pixels, pixel_rays, window_around, window_pixels
 from sira_mi.fit.shaded import Arrays
 from sira_mi.fit.stage import FitSettings, FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
@@ -109,7 +109,7 @@ class GeometryScene:
         self, portrait: Portrait, avatar: Avatar, avatar_path: str | Path, settings: FitSettings, exposure: float
     ):
         self.portrait, self.avatar, self.settings, self.exposure = portrait, avatar, settings, exposure
-        self.valid = modelled_pixels(portrait.camera)
+        self.valid = find_modelled_pixels(portrait.camera)
         self.windows = self._place_windows(round(settings.rays**0.5))
         path = str(avatar_path)
         self.scene = mi.load_dict(

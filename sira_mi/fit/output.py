@@ -37,16 +37,16 @@ SECOND_LIGHT = np.array(
 
 
 def render_layers(scene: mi.Scene) -> dict[str, np.ndarray]:
-    """All layers of an `avatar_scene`: [H, W, 3], one-channel ones [H, W]."""
+    """All layers of an `load_avatar_scene`: [H, W, 3], one-channel ones [H, W]."""
     return split_layers(mi.render(scene, spp=_SAMPLES, seed=mi.UInt32(0)).numpy())
 
 
 def render_radiance(scene: mi.Scene) -> np.ndarray:
-    """The radiance [H, W, 3] of an `avatar_scene`, with or without its extra channels."""
+    """The radiance [H, W, 3] of an `load_avatar_scene`, with or without its extra channels."""
     return mi.render(scene, spp=_SAMPLES, seed=mi.UInt32(0)).numpy()[..., :3]
 
 
-def avatar_scene(
+def load_avatar_scene(
     avatar_path: str,
     camera: Camera,
     lobes: np.ndarray,
@@ -73,7 +73,7 @@ def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
         write_png(folder / f"{name}.png", preview(name, image, layers["mask"]))
 
 
-def box_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
+def crop_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
     """The camera of a tile of the contact sheet: of the part `box` (x0, y0, x1, y1) of the photo's frame."""
     x0, y0, x1, y1 = box
     scale = _TILE / max(x1 - x0, y1 - y0)
@@ -91,14 +91,14 @@ def _tile(image: np.ndarray) -> np.ndarray:
     return np.asarray(canvas) / 255
 
 
-def contact_sheet(avatar_path: str, portrait: Portrait, layers: dict[str, np.ndarray], voxel: float) -> np.ndarray:
+def draw_contact_sheet(avatar_path: str, portrait: Portrait, layers: dict[str, np.ndarray], voxel: float) -> np.ndarray:
     """Display values of the sheet, cropped to the head: photo, mask, final, normals / diffuse albedo, specular albedo,
     the head turned both ways under a second light."""
     box = head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
-    close = box_camera(portrait.camera, box)
+    close = crop_camera(portrait.camera, box)
     turned = []
     for yaw in (-30, 30):
-        scene = avatar_scene(avatar_path, orbit(close, yaw), SECOND_LIGHT, voxel, extra_channels=False)
+        scene = load_avatar_scene(avatar_path, orbit(close, yaw), SECOND_LIGHT, voxel, extra_channels=False)
         turned.append(linear_to_srgb(render_radiance(scene)))
     x0, y0, x1, y1 = box
     names = ("final", "normal", "diffuse_albedo", "specular_albedo")

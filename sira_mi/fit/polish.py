@@ -78,11 +78,11 @@ class PolishProblem(AlbedoRefinementProblem):
 
     def __init__(self, stage: PolishStage, task: FitTask, surface: PhotoSurface, avatar_path: Path):
         super().__init__(stage, task, surface)
-        self.scene, self.target, self.share = polish_scene(
+        self.scene, self.target, self.share = load_polish_scene(
             surface.portrait, avatar_path, stage, task.settings.final_voxel
         )
         self.scene_parameters = mi.traverse(self.scene)
-        self.detail = picture_detail(self.scene, avatar_path)
+        self.detail = measure_detail(self.scene, avatar_path)
         shape = self.scene.shapes()[0]
         self.x_ref, self.gamma = evaluate_in_chunks(lambda x: deform(shape.field(), x), shape.vertices())
         self.jitter = 0.5 * shape.voxel
@@ -168,7 +168,7 @@ class PolishProblem(AlbedoRefinementProblem):
         return dr.detach(loss), derivatives
 
 
-def polish_scene(
+def load_polish_scene(
     portrait: Portrait, avatar_path: Path, stage: PolishStage, voxel: float
 ) -> tuple[mi.Scene, np.ndarray, np.ndarray]:
     """The path-traced head of an avatar file with its albedo refined in full, cropped and scaled to the size of the
@@ -196,7 +196,7 @@ def polish_scene(
     return scene, np.ascontiguousarray(photo, np.float32), weight.astype(np.float32)
 
 
-def picture_detail(scene: mi.Scene, avatar_path: Path) -> np.ndarray:
+def measure_detail(scene: mi.Scene, avatar_path: Path) -> np.ndarray:
     """What the path-traced picture is multiplied by, by pixel [h, w, 3]: where the mesh is too coarse for the albedo,
     the networks' diffuse albedo over that between vertices; and the refinement of the avatar's light."""
     closed_form = {"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)}
@@ -210,13 +210,13 @@ def picture_detail(scene: mi.Scene, avatar_path: Path) -> np.ndarray:
     return (albedo * light).astype(np.float32)
 
 
-def polish_gain(task: FitTask, stage: PolishStage, state: FitState) -> dict[str, list[float]]:
+def measure_polish(task: FitTask, stage: PolishStage, state: FitState) -> dict[str, list[float]]:
     """PSNR in dB of the head's pictures against the photo before and after the polish, in the size of the polish:
     `path_traced_psnr_db` and `closed_form_psnr_db`."""
     portrait, avatar, avatar_path = task.pose_portrait(state), task.prior, task.write_avatar(state.before_polish())
-    scene, photo, weight = polish_scene(portrait, avatar_path, stage, task.settings.final_voxel)
+    scene, photo, weight = load_polish_scene(portrait, avatar_path, stage, task.settings.final_voxel)
     closed_form = mi.load_dict({"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)})
-    detail = picture_detail(scene, avatar_path)
+    detail = measure_detail(scene, avatar_path)
     pictures: tuple[tuple[str, Any, np.ndarray | float], ...] = (
         ("path_traced", scene.integrator(), detail),
         ("closed_form", closed_form, 1.0),

@@ -42,7 +42,7 @@ def pixel_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[n
     return np.broadcast_to(camera.centre, direction.shape), direction
 
 
-def modelled_pixels(camera: Camera) -> np.ndarray:
+def find_modelled_pixels(camera: Camera) -> np.ndarray:
     """[H, W] bool: pixels whose ray crosses the domain box and does not leave it through its floor, below which a
     photo may show a body that the model does not have."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))

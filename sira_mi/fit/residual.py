@@ -24,7 +24,7 @@ from skimage.draw import polygon2mask
 
 from sira_mi.fields.columns import in_three, to_array
 from sira_mi.fit.shaded import PhotoPoints
-from sira_mi.fit.skin import near_landmarks
+from sira_mi.fit.skin import find_near_landmarks
 from sira_mi.optimisation import losses
 from sira_mi.portrait.landmarks import BROWS, EYES, LIPS, MOUTH
 from sira_mi.portrait.portrait import Portrait
@@ -96,7 +96,7 @@ def albedo_variances(portrait: Portrait, row: np.ndarray, column: np.ndarray) ->
     deviations[:] = _COMMON
     everywhere = np.ones(shape, bool)
     for group in (BROWS, MOUTH, *EYES):
-        deviations[near_landmarks(portrait.landmarks, group, everywhere)] = _FEATURES
+        deviations[find_near_landmarks(portrait.landmarks, group, everywhere)] = _FEATURES
     for opening in (*EYES, LIPS):
         outline = portrait.landmarks[list(opening)]
         if np.isfinite(outline).all():

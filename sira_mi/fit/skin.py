@@ -91,13 +91,15 @@ class SkinLevel:
         return weights @ y
 
 
-def skin_cues(portrait: Portrait) -> SkinCues | None:
+def find_skin_cues(portrait: Portrait) -> SkinCues | None:
     """The cues of a photo; None where no skin is visible."""
     luminance = _luminance_near(portrait, BARE_SKIN)
     return SkinCues(float(np.exp(np.log(luminance).mean())), _eyes(portrait)) if len(luminance) else None
 
 
-def near_landmarks(landmarks: np.ndarray, chosen: tuple[int, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_near_landmarks(
+    landmarks: np.ndarray, chosen: tuple[int, ...], mask: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the pixels of a `mask` [H, W] within `landmark_radius` of the `chosen` ones of landmarks
     [468, 2], pixels, NaN where unknown."""
     row, column = np.nonzero(mask)
@@ -117,7 +119,7 @@ def landmark_radius(landmarks: np.ndarray) -> float:
 
 
 def _luminance_near(portrait: Portrait, chosen: tuple[int, ...]) -> np.ndarray:
-    row, column = near_landmarks(portrait.landmarks, chosen, portrait.mask > 0.5)
+    row, column = find_near_landmarks(portrait.landmarks, chosen, portrait.mask > 0.5)
     return np.maximum(portrait.image[row, column] @ np.array(LUMINANCE), _DARKEST)
 
 
@@ -139,7 +141,7 @@ def _eyes(portrait: Portrait) -> tuple[Eye, ...]:
 def face_exposure(portrait: Portrait, prior: Avatar) -> float:
     """The factor that brings the skin of a photo to the luminance that skin has in the photos of the prior's training;
     1 where no skin is visible."""
-    cues = skin_cues(portrait)
+    cues = find_skin_cues(portrait)
     return 1.0 if cues is None else float(np.clip(prior.skin_prior().radiance / cues.radiance, *_EXPOSURES))
 
 
@@ -172,9 +174,9 @@ class SkinPatches:
         return skin.loss(albedo, weight, skin.tone_of_luminance(np.array([self.luminance])))
 
 
-def skin_patches(portrait: Portrait, points: SurfacePoints) -> SkinPatches | None:
+def find_skin_patches(portrait: Portrait, points: SurfacePoints) -> SkinPatches | None:
     """The points nearest to the photo's landmarks of bare skin; None without a face or where none is visible."""
-    cues = skin_cues(portrait)
+    cues = find_skin_cues(portrait)
     if cues is None or not len(points.row):
         return None
     landmarks = portrait.landmarks[list(BARE_SKIN)]

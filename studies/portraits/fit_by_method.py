@@ -75,7 +75,9 @@ def _write_head(out: Path, method: Method, prior: Avatar, camera: Camera, settin
         head = mi.load_dict({"type": "neural_sdf", "avatar": str(path), "voxel": settings.final_voxel})
         pictures = _geometry_pictures(camera, head)
     else:
-        scene = output.avatar_scene(str(path), camera, avatar.tensors["lobes"], settings.final_voxel, in_photo=True)
+        scene = output.load_avatar_scene(
+            str(path), camera, avatar.tensors["lobes"], settings.final_voxel, in_photo=True
+        )
         head = scene.shapes()[0]
         pictures = output.render_layers(scene)
     arrays = {

@@ -24,7 +24,7 @@ import numpy as np
 
 from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
-from sira_mi.fit.rays import modelled_pixels
+from sira_mi.fit.rays import find_modelled_pixels
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.landmarks import NOSE_TIP
 from sira_mi.training.collection.skin import EYE, SKIN
@@ -134,7 +134,7 @@ def score_geometry(
     directions' means; `ALIGNMENT_scale` and `ALIGNMENT_turn` (degrees), of the map from prediction to truth, for the
     cameras from camera to camera; `landmarks_used` of six and their root mean square distance `landmarks_rms`; and
     the scores of `score_normals` and `silhouette_iou`, the latter where a head model can be: over the pixels of
-    `fit.rays.modelled_pixels`. Raises InputError for a prediction that cannot be measured."""
+    `fit.rays.find_modelled_pixels`. Raises InputError for a prediction that cannot be measured."""
     settings = settings or GeometrySettings()
     prediction.check(truth.camera.height, truth.camera.width)
     surface = surface or true_surface(truth, settings)
@@ -174,7 +174,7 @@ def score_geometry(
         normal = images.normal if normal is None else normal
         mask = images.mask if mask is None else mask
     scores |= score_normals(normal, mask, prediction.camera, truth, surface)
-    modelled = modelled_pixels(truth.camera)
+    modelled = find_modelled_pixels(truth.camera)
     scores["silhouette_iou"] = silhouette_iou(np.where(modelled, mask, 0), np.where(modelled, truth.mask, 0))
     return scores
 

@@ -12,7 +12,7 @@ from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import QUALITIES
-from sira_mi.fit.skin import SkinCues, SkinLevel, cue_arrays, near_landmarks, skin_cues
+from sira_mi.fit.skin import SkinCues, SkinLevel, cue_arrays, find_near_landmarks, find_skin_cues
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
 from sira_mi.training.collection.skin import SKIN
@@ -57,7 +57,7 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
         folder = benchmark / entry["name"]
         luminance = true_luminance(load_truth(folder / "truth.npz"))
         try:
-            cues = skin_cues(make_portrait(folder / "photo.jpg", settings, landmarks))
+            cues = find_skin_cues(make_portrait(folder / "photo.jpg", settings, landmarks))
         except InputError:
             cues = None
         if cues is None or luminance is None:
@@ -72,7 +72,7 @@ def true_luminance(truth: Truth) -> float | None:
     pixels = np.full((len(truth.landmarks), 2), np.nan)
     known = np.isfinite(truth.landmarks).all(axis=1)
     pixels[known] = truth.camera.project(truth.landmarks[known])
-    row, column = near_landmarks(pixels, BARE_SKIN, (truth.mask > 0.5) & (truth.region == SKIN))
+    row, column = find_near_landmarks(pixels, BARE_SKIN, (truth.mask > 0.5) & (truth.region == SKIN))
     return float((truth.diffuse_albedo[row, column] @ np.array(LUMINANCE)).mean()) if len(row) else None
 
 

@@ -126,7 +126,9 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
 
     camera = task.pose_portrait(progress.state).camera
     lobes = avatar.tensors["lobes"]
-    scene = output.avatar_scene(str(folder / "avatar.safetensors"), camera, lobes, settings.final_voxel, in_photo=True)
+    scene = output.load_avatar_scene(
+        str(folder / "avatar.safetensors"), camera, lobes, settings.final_voxel, in_photo=True
+    )
     layers, head = output.render_layers(scene), scene.shapes()[0]
     shown = (linear_to_srgb(portrait.image), linear_to_srgb(layers["final"]), 0.5 + 0.5 * layers["normal"])
     write_png(picture, np.concatenate(shown, axis=1))
