@@ -180,6 +180,76 @@ def test_linear_exr_is_taken_as_it_is(tmp_path):
         one_line(error, "NaN")
 
 
+ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+REC_2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+
+
+@pytest.mark.parametrize("name, chromaticities", [("ACES2065-1", ACES_AP0), ("ITU-R BT.2020", REC_2020)])
+def test_exr_chromaticities_are_converted(tmp_path, name, chromaticities):
+    import colour
+
+    pixels = np.random.default_rng(2).uniform(0.3, 0.5, (40, 50, 3)).astype(np.float32)
+    OpenEXR.File({"chromaticities": chromaticities}, {"RGB": pixels}).write(str(tmp_path / "wide.exr"))
+    spaces = colour.RGB_COLOURSPACES
+    matrix = colour.matrix_RGB_to_RGB(spaces[name], spaces["sRGB"], "Bradford")
+    np.testing.assert_allclose(load_photo(tmp_path / "wide.exr").image, np.maximum(pixels @ matrix.T, 0), atol=1e-3)
+
+
+def _exr_parts(**channels: dict[str, np.ndarray]) -> OpenEXR.File:
+    return OpenEXR.File(
+        [OpenEXR.Part({"name": n, "type": OpenEXR.scanlineimage}, planes) for n, planes in channels.items()]
+    )
+
+
+def test_exr_part_with_the_picture_is_read(tmp_path):
+    path = tmp_path / "several.exr"
+    depth, picture = {"Z": np.ones((64, 64), np.float32)}, {"RGB": np.full((64, 64, 3), 0.4, np.float32)}
+    for parts in ({"a": depth, "b": picture}, {"a": picture, "b": depth}, {"a": {"Y": depth["Z"]}, "b": picture}):
+        _exr_parts(**parts).write(str(path))
+        np.testing.assert_allclose(load_photo(path).image, 0.4)
+    _exr_parts(a={"Z": np.ones((64, 64), np.float32)}, b={"A": np.ones((64, 64), np.float32)}).write(str(path))
+    with pytest.raises(InputError, match="no part has channels R, G, B or Y, only A, Z"):
+        load_photo(path)
+
+
+def test_exr_fills_its_display_window(tmp_path):
+    """Pixels outside of the data window are black and transparent; those outside of the display window are cut off."""
+    corner = np.array
+    header = {"displayWindow": (corner([10, 20], np.int32), corner([109, 99], np.int32))}
+    ramp = np.arange(60 * 70, dtype=np.float32).reshape(60, 70)
+    path = tmp_path / "window.exr"
+    for left, top in ((30, 25), (0, 0), (90, 70), (500, 500)):
+        window = (corner([left, top], np.int32), corner([left + 69, top + 59], np.int32))
+        OpenEXR.File({**header, "dataWindow": window}, {c: ramp for c in "RGB"}).write(str(path))
+        expected = np.zeros((1000, 1000))
+        expected[top : top + 60, left : left + 70] = ramp
+        np.testing.assert_array_equal(load_photo(path).image[..., 1], expected[20:100, 10:110])
+
+
+def test_exr_colours_are_divided_by_alpha(tmp_path):
+    alpha = np.tile(np.linspace(0, 1, 64, dtype=np.float32), (64, 1))
+    pixels = np.dstack([0.3 * alpha, 0.5 * alpha, 0.7 * alpha, alpha])
+    OpenEXR.File({}, {"RGBA": pixels}).write(str(tmp_path / "cut.exr"))
+    photo = load_photo(tmp_path / "cut.exr")
+    np.testing.assert_allclose(photo.image[:, 1:], np.broadcast_to([0.3, 0.5, 0.7], (64, 63, 3)), rtol=1e-5)
+    np.testing.assert_array_equal(photo.alpha, alpha)
+
+
+def test_exr_that_cannot_be_taken_as_it_says_is_refused(tmp_path):
+    """Anamorphic pixels, primaries of no RGB space, and more pixels than fit; the latter before they are decoded."""
+    path = tmp_path / "odd.exr"
+    grey = np.full((128, 64, 3), 0.3, np.float32)
+    for header, words in (
+        ({"pixelAspectRatio": 2.0}, "not square"),
+        ({"chromaticities": (0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3)}, "no RGB space"),
+        ({"displayWindow": (np.array([0, 0], np.int32), np.array([15999, 7999], np.int32))}, "128 megapixels"),
+    ):
+        OpenEXR.File(header, {"RGB": grey}).write(str(path))
+        with pytest.raises(InputError, match=words) as error:
+            load_photo(path)
+        one_line(error, str(path))
+
+
 def _bad_photos(folder: Path, astronaut: np.ndarray) -> dict[str, Path]:
     good = folder / "good.jpg"
     Image.fromarray(astronaut).save(good)

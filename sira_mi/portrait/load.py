@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import OpenEXR
 from PIL import Image, ImageCms
 
 from sira_mi.errors import InputError
@@ -18,12 +17,14 @@ from sira_mi.files import read_exr
 
 MIN_SIDE = 32  # pixels; anything smaller holds no face that could be fitted
 MAX_FILE_PIXELS = 400_000_000
+MAX_EXR_PIXELS = 100_000_000  # of all parts: 1.6 GB of R, G, B and alpha
 DEFAULT_MAX_PIXELS = 26_000_000
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM, _TIFF_WIDTH, _TIFF_HEIGHT = 0x0112, 0x8769, 0xA405, 256, 257
 _FLIPS_X, _FLIPS_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations that reverse the stored x or y axis
 _STRIP_PIXELS = 4_000_000
+_LEAST_ALPHA = 1 / 255  # premultiplied colours of less say nothing
 _GREYS = ("1", "L", "LA", "La", "I;16", "I;16B", "I;16L", "I;16N")
 
 
@@ -309,19 +310,16 @@ def _exif(picture: Image.Image, notes: list[str]) -> tuple[int, float | None]:
 
 
 def _load_exr(path: Path, max_pixels: int) -> Photo:
-    try:
-        header = OpenEXR.File(str(path), header_only=True).header()
-        lower, upper = header["dataWindow"]
-        width, height = (int(upper[i] - lower[i] + 1) for i in (0, 1))
-    except Exception:  # OpenEXR raises bare RuntimeError and others
-        raise InputError(f"{path} is not an EXR that can be read: export it again") from None
-    _check_size(path, width, height)
-    image, alpha = read_exr(path)
-    factor = _reduction(width, height, max_pixels)
-    image = _block_mean(image[: height // factor * factor, : width // factor * factor], factor)
+    image, alpha = read_exr(path, lambda width, height: _check_size(path, width, height), MAX_EXR_PIXELS)
+    height, width = image.shape[:2]
     if alpha is not None:
-        alpha = np.nan_to_num(np.asarray(alpha, np.float32))[: height // factor * factor, : width // factor * factor]
-        alpha = np.clip(_block_mean(alpha[..., None], factor)[..., 0], 0, 1)
+        alpha = np.clip(np.nan_to_num(alpha), 0, 1)
+        image = image / np.where(alpha > _LEAST_ALPHA, alpha, 1)[..., None]  # OpenEXR's colours are premultiplied
+    factor = _reduction(width, height, max_pixels)
+    rows, columns = height // factor * factor, width // factor * factor
+    image = _block_mean(image[:rows, :columns], factor)
+    if alpha is not None:
+        alpha = _block_mean(alpha[:rows, :columns, None], factor)[..., 0]
     size = (width, height)
     return Photo(np.maximum(image, 0), alpha, None, 1, size, size, factor, ())
 

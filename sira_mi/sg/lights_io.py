@@ -90,8 +90,10 @@ def read_environment(path: str | Path) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    image, _ = read_exr(path)
-    height, width = image.shape[:2]
-    if max(height, width) > _MAXIMUM_SIDE or height < 2 or not 1.8 <= width / height <= 2.2:
-        raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
+
+    def check_size(width: int, height: int) -> None:
+        if max(height, width) > _MAXIMUM_SIDE or height < 2 or not 1.8 <= width / height <= 2.2:
+            raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
+
+    image, _ = read_exr(path, check_size)
     return np.maximum(image, 0.0)
