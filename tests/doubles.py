@@ -1,9 +1,15 @@
-"""Networks and the field in NumPy and float64, written from their definitions: what the fast ones are compared with."""
+"""Slow references that the fast implementations are compared with: networks and the field in NumPy and float64, hits by
+bisection, shading lobe by lobe."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.shape import HeadShape
-from sira_mi.fields.sdf import SdfField
+from sira_mi.fields.sdf import SdfField, signed_distance
+from sira_mi.fields.tracing import on_ray
+from sira_mi.sg.lobes import lobe_count, unpack_lobe
+from sira_mi.sg.shading import diffuse_irradiance, specular_radiance
 
 
 def head_field(avatar, **replaced) -> SdfField:
@@ -44,3 +50,25 @@ def field_in_double(avatar, x: np.ndarray) -> np.ndarray:
     networks, t, octaves = avatar.architecture.networks, avatar.tensors, avatar.architecture.sdf_octaves
     delta = in_double(networks["deformation"], t["deformation"], t["z_sdf"], encoded_in_double(x, octaves))[:3]
     return in_double(networks["reference"], t["reference"], None, encoded_in_double(x + delta, octaves))[0]
+
+
+def find_hits_by_bisection(field: SdfField, origin, direction, t_outside, t_inside, iterations: int = 40):
+    """Ray parameters [1, N] of hits, by bisection between a parameter outside and one inside the surface [1, N]."""
+    with dr.suspend_grad():
+        for _ in range(iterations):
+            middle = 0.5 * (t_outside + t_inside)
+            outside = signed_distance(field, on_ray(origin, direction, middle)) > 0
+            t_outside = dr.select(outside, middle, t_outside)
+            t_inside = dr.select(outside, t_inside, middle)
+            dr.eval(t_outside, t_inside)
+        return 0.5 * (t_outside + t_inside)
+
+
+def shade_lobe_by_lobe(normal, view, specular_albedo, roughness, lobes):
+    """`sira_mi.sg.shading.shade` by a Python loop over the lobes, differentiated by Dr.Jit."""
+    irradiance, specular = mi.Color3f(0.0), mi.Color3f(0.0)
+    for index in range(lobe_count(lobes)):
+        lobe = unpack_lobe(lobes.array, index)
+        irradiance += diffuse_irradiance(normal, *lobe)
+        specular += specular_radiance(normal, view, specular_albedo, roughness, *lobe)
+    return irradiance, specular

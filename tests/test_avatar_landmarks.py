@@ -22,9 +22,9 @@ from sira_mi.portrait.head_landmarks import (
     find_view_direction,
     load_shipped_correction,
 )
-from sira_mi.training.landmark_regression import landmark_tensors
 from studies.portraits.measure_landmarks import Observation, fit_correction, measure_held_out_errors
 from studies.priors import fit_landmark_model
+from studies.priors.landmark_regression import landmark_tensors
 
 MEAN = np.random.default_rng(11).uniform(-0.5, 0.5, (LANDMARKS, 3))
 MEAN[[33, 263]] = (-0.2, -0.1, -0.2), (0.2, -0.1, -0.2)

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import slopes
-from doubles import field_in_double, head_field
+from doubles import field_in_double, find_hits_by_bisection, head_field
 
 from sira_mi.conventions import DOMAIN_LOWER
 from sira_mi.fields import columns, extraction, sdf, tracing
@@ -25,7 +25,7 @@ def exact_hits(field, origin, direction):
         mi.TensorXf(np.full((1, origin.shape[1]), 1.8, np.float32)),
         mi.TensorXf(np.full((1, origin.shape[1]), 4.0, np.float32)),
     )
-    return tracing.bisection_hits_reference(field, mi.TensorXf(origin), mi.TensorXf(direction), outside, inside)
+    return find_hits_by_bisection(field, mi.TensorXf(origin), mi.TensorXf(direction), outside, inside)
 
 
 @pytest.mark.parametrize("offset", [0.02, -0.02])

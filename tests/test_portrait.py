@@ -10,21 +10,11 @@ from PIL import Image
 
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.portrait import (
-    PortraitSettings,
-    estimate_camera,
-    find_faces,
-    linear_to_srgb,
-    load_mask,
-    load_photo,
-    make_portrait,
-    measure_reprojection_error,
-    segment_person,
-    select_face,
-    srgb_to_linear,
-)
-from sira_mi.portrait.mask import guided_filter
-from sira_mi.portrait.portrait import Portrait, area_resample, halve
+from sira_mi.portrait.camera import estimate_camera, measure_reprojection_error
+from sira_mi.portrait.face import find_faces, select_face
+from sira_mi.portrait.load import linear_to_srgb, load_photo, srgb_to_linear
+from sira_mi.portrait.mask import guided_filter, load_mask, segment_person
+from sira_mi.portrait.portrait import Portrait, PortraitSettings, area_resample, halve, make_portrait
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112

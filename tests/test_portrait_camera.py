@@ -8,12 +8,8 @@ from conftest import a_camera, one_line
 
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.portrait import (
-    Camera,
-    PortraitSettings,
-    estimate_camera,
-    measure_reprojection_error,
-)
+from sira_mi.portrait.camera import Camera, estimate_camera, measure_reprojection_error
+from sira_mi.portrait.portrait import PortraitSettings
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112

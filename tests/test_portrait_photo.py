@@ -13,12 +13,8 @@ from conftest import one_line
 from PIL import Image, ImageCms, ImageOps
 
 from sira_mi.errors import InputError
-from sira_mi.portrait import (
-    PortraitSettings,
-    linear_to_srgb,
-    load_photo,
-    srgb_to_linear,
-)
+from sira_mi.portrait.load import linear_to_srgb, load_photo, srgb_to_linear
+from sira_mi.portrait.portrait import PortraitSettings
 
 SETTINGS = PortraitSettings(working_size=512)
 ORIENTATION = 0x0112

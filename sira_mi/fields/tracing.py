@@ -104,18 +104,6 @@ def refine_hits(field: SdfField, origin: np.ndarray, direction: np.ndarray, t: n
     return result
 
 
-def bisection_hits_reference(field: SdfField, origin, direction, t_outside, t_inside, iterations: int = 40):
-    """Slow reference of `newton_hits`: bisection between a parameter outside and one inside the surface [1, N]."""
-    with dr.suspend_grad():
-        for _ in range(iterations):
-            middle = 0.5 * (t_outside + t_inside)
-            outside = signed_distance(field, on_ray(origin, direction, middle)) > 0
-            t_outside = dr.select(outside, middle, t_outside)
-            t_inside = dr.select(outside, t_inside, middle)
-            dr.eval(t_outside, t_inside)
-        return 0.5 * (t_outside + t_inside)
-
-
 def differentiable_hit(field: SdfField, origin, direction, t):
     """The exact hit [3, N] at ray parameters t [1, N], with its derivative in the field's parameters θ: o + t(θ) v,
     t(θ) = t₀ − (f(x₀; θ) − f(x₀; θ₀)) / (∇f·v) (IDR, Yariv et al. 2020)."""

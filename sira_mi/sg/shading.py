@@ -1,24 +1,19 @@
 """The integrals of eq. 8 in closed form under an environment of spherical Gaussians, without shadows.
 
 Irradiance is ∫ l (n·ω)₊ dω; specular radiance is ∫ l f^s (n·ω)₊ dω with f^s of `brdf.py`, by the lobes of
-`specular.py`. `specular_lobe` and `specular_radiance_physg` are PhySG's warped distribution and its closed form with
-one cosine integral instead of a two-term cosine: the baseline that `specular.py` improves on.
+`specular.py`.
 """
 
-import math
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
-from sira_mi.sg import brdf
 from sira_mi.sg.arrays import Color3f, Float, TensorXf, Vector3f
-from sira_mi.sg.integrals import cosine_integral, product
+from sira_mi.sg.integrals import cosine_integral
 from sira_mi.sg.lobes import interleave, lobe_count, unpack_lobe, unpack_raw
 from sira_mi.sg.specular import SpecularLobes, specular_integrals, specular_lobes
 
-# A view direction lower than this cosine is shaded as if at it: PhySG's warped sharpness is λ/(4 n·v).
-_MINIMUM_VIEW_COSINE = 1e-3
 # Points that one lane adds up in the adjoint of the lobes; fixed, so that the order of the sum is.
 _POINTS_PER_LANE = 32
 
@@ -26,14 +21,6 @@ _POINTS_PER_LANE = 32
 def diffuse_irradiance(normal: Vector3f, axis: Vector3f, sharpness: Float, amplitude: Color3f) -> Color3f:
     """∫ G (ω·n)₊ dω of one light lobe: irradiance `[..., 3]`; times albedo/π it is diffuse radiance."""
     return amplitude * cosine_integral(dr.dot(normal, axis), sharpness)
-
-
-def specular_lobe(normal: Vector3f, view: Vector3f, roughness: Float) -> tuple[Vector3f, Float, Float]:
-    """PhySG's warped distribution as a lobe of light directions: mirror axis, sharpness λ/(4 n·v), 1/(πr⁴)."""
-    cosine = dr.maximum(dr.dot(normal, view), _MINIMUM_VIEW_COSINE)
-    sharpness = brdf.distribution_sharpness(roughness)
-    mirror = dr.normalize(2.0 * cosine * normal - view)
-    return mirror, sharpness / (4.0 * cosine), sharpness * (0.5 / math.pi)
 
 
 def specular_radiance(
@@ -48,25 +35,6 @@ def specular_radiance(
     """∫ G f^s (ω·n)₊ dω of one light lobe `[..., 3]`, 0 where the view is below the surface."""
     white, grazing = specular_integrals(specular_lobes(normal, view, roughness), axis, sharpness)
     return amplitude * dr.lerp(grazing, white, specular_albedo)
-
-
-def specular_radiance_physg(
-    normal: Vector3f,
-    view: Vector3f,
-    specular_albedo: Float,
-    roughness: Float,
-    axis: Vector3f,
-    sharpness: Float,
-    amplitude: Color3f,
-) -> Color3f:
-    """`specular_radiance` as in PhySG: one warped lobe, Fresnel and masking at the mirror direction."""
-    cosine = dr.dot(normal, view)
-    lobe_axis, lobe_sharpness, lobe_amplitude = specular_lobe(normal, view, roughness)
-    joint_axis, joint_sharpness, log_amplitude = product(lobe_axis, lobe_sharpness, axis, sharpness)
-    integral = dr.exp(log_amplitude) * cosine_integral(dr.dot(normal, joint_axis), joint_sharpness)
-    cos_mirror = dr.maximum(cosine, _MINIMUM_VIEW_COSINE)
-    moment = dr.square(brdf.masking(cos_mirror, roughness)) * brdf.fresnel(specular_albedo, cos_mirror)
-    return amplitude * dr.select(cosine > 0.0, 0.25 * lobe_amplitude * moment * integral, 0.0)
 
 
 class DiffusePoint(NamedTuple):
@@ -243,13 +211,3 @@ def shade_tensor(
     albedo = specular_albedo.array if isinstance(specular_albedo, mi.TensorXf) else specular_albedo
     result = shade(mi.Vector3f(normal), mi.Vector3f(view), albedo, roughness, lobes)
     return mi.TensorXf(result[0]), mi.TensorXf(result[1])
-
-
-def shade_reference(normal, view, specular_albedo, roughness, lobes):
-    """`shade` by a Python loop over the lobes, differentiated by Dr.Jit: the slow reference."""
-    irradiance, specular = mi.Color3f(0.0), mi.Color3f(0.0)
-    for index in range(lobe_count(lobes)):
-        lobe = unpack_lobe(lobes.array, index)
-        irradiance += diffuse_irradiance(normal, *lobe)
-        specular += specular_radiance(normal, view, specular_albedo, roughness, *lobe)
-    return irradiance, specular

@@ -18,6 +18,7 @@ from sira_mi.sg.lobes import lobe_count, unpack_lobe
 from sira_mi.sg.radiance import Material, closed_form_radiance, reflect
 from sira_mi.sg.sampling import LobeMixture
 from studies.crosscheck.points import Points
+from studies.numerics.physg import specular_lobe
 from studies.stability import double
 
 # Arrays of Dr.Jit, whose stubs know neither their arithmetic between types nor symbolic loops.
@@ -106,7 +107,7 @@ def physg(points: Points, lobes: np.ndarray, roughness: float, k_s: float) -> np
 
     def columns(normal, view, diffuse, specular):
         n, v, s = from_columns(normal, mi.Vector3f), from_columns(view, mi.Vector3f), from_columns(specular, mi.Float)
-        warped: tuple[Array, ...] = shading.specular_lobe(n, v, rough)
+        warped: tuple[Array, ...] = specular_lobe(n, v, rough)
         warped_axis, warped_sharpness, warped_amplitude = warped
         cosine: Array = dr.dot(n, v)
         safe: Array = dr.maximum(cosine, 1e-3)

