@@ -78,6 +78,7 @@ def test_mitsuba_meets_the_field_where_its_mesh_is(scene):
     assert distance(ray(t)).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_head_moved_turned_and_scaled_is_the_same_head_from_a_moved_camera(avatar_path):
     """A camera moved with the head, at a scaled distance, sees the same picture."""
     matrix = mi.ScalarTransform4f().translate([1.0, 2.0, -0.5]).rotate([0.6, 0.8, 0.0], 40).scale(1.7)

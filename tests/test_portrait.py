@@ -215,6 +215,7 @@ def test_portrait_of_the_test_photo(photo_file, head, astronaut, mask):
     assert np.array_equal(again.landmarks, portrait.landmarks) and np.array_equal(again.camera.K, portrait.camera.K)
 
 
+@pytest.mark.slow
 def test_small_face_in_a_large_photo_is_cropped(tmp_path, head, astronaut, face):
     page = np.full((900, 1600, 3), 90, np.uint8)
     page[300:812, 900:1412] = astronaut

@@ -67,6 +67,7 @@ def test_a_method_and_what_it_goes_on_from_take_the_steps_of_the_fit():
         assert stages == quality.stages
 
 
+@pytest.mark.slow
 def test_the_ablated_fits_differ_in_what_they_say(tmp_path):
     """a.3 compares the photo at its own exposure; in b.6 nothing blocks the light."""
     prior, nowhere = load_avatar(PRIOR), np.full((468, 2), np.nan)

@@ -324,6 +324,7 @@ def test_the_reference_of_the_ablations_differs_from_them(balls, coarse):
     assert np.abs(values[0] - values[1]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_missing_files_are_named(balls, tmp_path):
     collection, runs = balls
     with pytest.raises(InputError, match=r"shape\.checkpoint is missing; run python -m sira_mi\.training shape"):

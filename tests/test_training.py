@@ -144,6 +144,7 @@ def test_the_terms_that_can_be_left_out_are_those_of_the_losses(collection):
         train.without_term(settings, train.SHAPE_TERMS, "learning_rate")
 
 
+@pytest.mark.slow
 def test_so_are_those_of_the_appearance(collection, run):
     """All but the colour, whose weight is 1."""
     shape, _ = read_parameters(run / "shape.checkpoint")
@@ -173,6 +174,7 @@ def test_sizes_replace_those_of_the_architecture():
 # Whole trainings by the command
 
 
+@pytest.mark.slow
 def test_the_command_trains_both_models_at_the_given_sizes(run, collection):
     parameters, metadata = read_parameters(run / "shape.checkpoint")
     assert train.read_architecture(metadata, run / "shape.checkpoint") == SMALL
@@ -185,6 +187,7 @@ def test_the_command_trains_both_models_at_the_given_sizes(run, collection):
         assert picture.shape[0] % pictures.TILE[0] == 0 and picture.std() > 5
 
 
+@pytest.mark.slow
 def test_a_resume_with_other_options_is_refused(run, collection):
     options = {"steps": 9, "sizes": SIZES}
     with pytest.raises(InputError, match="sdf_width: 32 there, 48 now"):

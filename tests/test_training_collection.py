@@ -220,6 +220,7 @@ def test_distance_to_triangles_against_dense_sampling():
     assert np.allclose(np.linalg.norm(points - closest, axis=1), reference, atol=0.01)
 
 
+@pytest.mark.slow
 def test_scene_has_the_documented_layout(arrays):
     assert set(arrays) == set(scene.LAYOUT)
     count, views = arrays["visible"].shape
@@ -236,6 +237,7 @@ def test_scene_has_the_documented_layout(arrays):
     assert {"seed", "person", "light", "licence"} <= set(info) and info["person"]["hair"]["name"] == "cap"
 
 
+@pytest.mark.slow
 def test_stored_colours_are_the_pixels_the_points_project_to(arrays):
     """Reprojection with the stored OpenCV cameras, nearest pixel instead of the stored bilinear lookup."""
     checked = 0
@@ -255,6 +257,7 @@ def test_stored_colours_are_the_pixels_the_points_project_to(arrays):
     assert arrays["visible"].any(1).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_signed_distance_agrees_with_points_and_normals(arrays):
     """|distance| is at most the gap to the nearest stored point; beside the surface the sign is the normal's."""
     gap, near = cKDTree(arrays["points"]).query(arrays["volume"])
@@ -267,6 +270,7 @@ def test_signed_distance_agrees_with_points_and_normals(arrays):
     assert (distance[floor] < 0).all(), "the middle of the head is inside"
 
 
+@pytest.mark.slow
 def test_frontal_exposure_is_photographic(arrays):
     """The stored frontal view has the luminance that `info` tells: the drawn one times a factor of the albedo."""
     target = json.loads(str(arrays["info"]))["frontal_luminance"]
@@ -278,6 +282,7 @@ def test_frontal_exposure_is_photographic(arrays):
     assert luminance[arrays["masks"][0][rows] > 0].mean() == pytest.approx(target, rel=0.1)
 
 
+@pytest.mark.slow
 def test_albedo_images_are_the_albedo_of_the_points(arrays):
     """Points that a held-out view sees project to pixels of their own albedo and specular strength."""
     for row, view in enumerate(HELD_OUT_VIEWS):

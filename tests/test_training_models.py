@@ -198,6 +198,7 @@ def test_shape_training_lowers_the_loss(shape):
     assert all(np.isfinite(v).all() for v in parameters.values())
 
 
+@pytest.mark.slow
 def test_shape_training_resumes_to_the_same_bits(shape, two_scenes, tmp_path):
     train_shape(tmp_path, two_scenes, until=12)
     resumed, seen = train_shape(tmp_path, two_scenes)
@@ -261,6 +262,7 @@ def appearance(shape, two_scenes, tmp_path_factory):
     return train_appearance(tmp_path_factory.mktemp("whole"), two_scenes, shape[0])
 
 
+@pytest.mark.slow
 def test_appearance_training_lowers_the_loss(appearance):
     parameters, seen = appearance
     assert np.mean(seen[-5:]) < 0.85 * np.mean(seen[:3])
@@ -282,6 +284,7 @@ def test_the_specular_albedo_is_held_near_the_level_of_its_region(shape, two_sce
     assert found == pytest.approx(cloth * np.log(0.03 / 0.008) ** 2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_appearance_training_resumes_to_the_same_bits(appearance, shape, two_scenes, tmp_path):
     train_appearance(tmp_path, two_scenes, shape[0], until=11)
     resumed, seen = train_appearance(tmp_path, two_scenes, shape[0])
@@ -328,6 +331,7 @@ def test_the_whitened_network_takes_standard_normal_latents(name):
         np.testing.assert_allclose(outputs(moved, z), original, atol=2e-5 * np.abs(original).max())
 
 
+@pytest.mark.slow
 def test_the_assembled_prior_is_an_avatar(shape, appearance, two_scenes, tmp_path):
     from sira_mi.avatar.file import load_avatar, save_avatar
 
