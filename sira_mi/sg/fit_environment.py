@@ -34,14 +34,19 @@ class EnvironmentFit:
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions `[H, W, 3]` of pixel centres and exact solid angles `[H]` in steradians, Mitsuba's convention."""
+    """Unit directions `[H, W, 3]` of the pixels of an image of two rows or more, and their exact solid angles `[H]` in
+    steradians, as Mitsuba's `envmap` has them: the first and the last row lie at the poles, columns half a pixel off
+    the seam, and radiance is interpolated bilinearly between."""
     phi = 2.0 * np.pi * (np.arange(width) + 0.5) / width
-    theta = np.pi * (np.arange(height) + 0.5) / height
+    theta = np.linspace(0.0, np.pi, height)
     sine = np.sin(theta)[:, None]
     cosine = np.broadcast_to(np.cos(theta)[:, None], (height, width))
     directions = np.stack([np.sin(phi) * sine, cosine, -np.cos(phi) * sine], axis=-1)
-    edges = np.cos(np.pi * np.arange(height + 1) / height)
-    return directions, (edges[:-1] - edges[1:]) * 2.0 * np.pi / width
+    # ∫ sin θ times the hat function of a row; at the poles it is half a hat.
+    step = np.pi / (height - 1)
+    share = np.sin(theta) * 2.0 * (1.0 - np.cos(step)) / step
+    share[[0, -1]] = 1.0 - np.sin(step) / step
+    return directions, share * 2.0 * np.pi / width
 
 
 def total_light(image: np.ndarray) -> np.ndarray:
