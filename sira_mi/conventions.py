@@ -16,6 +16,8 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 # Face landmarks of a photo or a head; `portrait/landmarks.py` names them.
 LANDMARKS = 468
+# As many determine the pose of a head in a photo.
+LEAST_LANDMARKS = 6
 
 # Views of every training scene that are held out of training, for comparison with renderings.
 HELD_OUT_VIEWS = (3, 6)

@@ -1,8 +1,12 @@
-"""Writes files whole or not at all; reads and writes the image formats of the project."""
+"""Checks and reads a user's files; writes files whole or not at all; the image formats of the project."""
 
+import json
+import math
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -12,6 +16,8 @@ from sira_mi.colour import REC_709, convert_to_rec709
 from sira_mi.errors import InputError
 
 MAX_EXR_PIXELS = 1 << 29  # of all parts together
+# Of a JSON file, unless its reader says otherwise.
+_MAXIMUM_JSON_BYTES = 4 << 20
 
 
 def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
@@ -34,6 +40,66 @@ def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """A text file in UTF-8. Raises InputError as `write_through` does."""
     write_through(path, lambda file: file.write_text(text, encoding="utf-8"))
+
+
+def check_file(path: str | Path, what: str, largest: int | None = None) -> Path:
+    """The path of a user's file, which messages call `what`; `largest` is the most bytes that it may have.
+
+    Raises InputError unless it is a regular file, neither empty nor too large, that can be read. Pipes and devices are
+    never opened."""
+    path = Path(path)
+    try:
+        os.fspath(path).encode()
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise InputError(f"{path} is a folder: the {what} must be a file")
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path} is a pipe or a device: the {what} must be a file")
+        with path.open("rb"):
+            pass
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such {what} file") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError:  # a null byte, or bytes that are not UTF-8
+        raise InputError(f"{str(path)!r} is no file name in UTF-8: rename the {what} file") from None
+    if status.st_size == 0:
+        raise InputError(f"{path} is an empty file, no {what}")
+    if largest is not None and status.st_size > largest:
+        raise InputError(f"{path} has {status.st_size / 2**20:.1f} MB: larger than any {what} ({largest >> 20} MB)")
+    return path
+
+
+def read_json(path: str | Path, what: str, largest: int = _MAXIMUM_JSON_BYTES) -> Any:
+    """The contents of a user's JSON file. Raises InputError as `check_file` and `parse_json` do."""
+    path = check_file(path, what, largest)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+    return parse_json(data, str(path))
+
+
+def parse_json(text: str | bytes, source: str) -> Any:
+    """JSON text as Python objects; bytes are UTF-8, UTF-16 or UTF-32, with or without a byte order mark.
+
+    Raises InputError that names `source` for anything else, and for numbers that are not finite in float64."""
+
+    def check(number: str) -> str:
+        if not math.isfinite(float(number)):
+            shown = number if len(number) < 20 else f"{number[:16]}..."
+            raise InputError(f"{source} contains NaN or infinity ({shown})")
+        return number
+
+    try:
+        return json.loads(
+            text,
+            parse_int=lambda number: int(check(number)),
+            parse_float=lambda number: float(check(number)),
+            parse_constant=check,
+        )
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{source} is not JSON: {error}") from None
 
 
 def read_exr(

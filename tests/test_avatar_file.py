@@ -12,6 +12,7 @@ from safetensors.numpy import save
 from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.file import FORMAT, load_avatar, load_prior, save_avatar
 from sira_mi.avatar.skin_tone import SkinPrior
+from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 
 
@@ -48,6 +49,7 @@ def test_round_trip(avatar, tmp_path):
 def test_what_a_prior_expects_of_skin_comes_back(avatar, tmp_path):
     """A file of an earlier version opens without it, but is no prior to fit with."""
     skin = SkinPrior(radiance=0.3, deviations=(0.5, 0.1), mean=(-1.0, -2.0, -3.0), axis=(0.1, 0.2, 0.7))
+    avatar = avatar.with_tensors(landmarks=np.random.default_rng(0).random((LANDMARKS, 3)))
     save_avatar(tmp_path / "a", dataclasses.replace(avatar, skin=skin))
     assert load_avatar(tmp_path / "a").skin == load_prior(tmp_path / "a").skin == skin
     save_avatar(tmp_path / "a", dataclasses.replace(avatar, skin=None))
@@ -55,6 +57,22 @@ def test_what_a_prior_expects_of_skin_comes_back(avatar, tmp_path):
     with pytest.raises(InputError, match=r"earlier version.*python -m sira_mi\.training appearance") as caught:
         load_prior(tmp_path / "a")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("known", ["none", "five", "one place", "a plane"])
+def test_a_prior_without_landmarks_is_refused(avatar, tmp_path, known):
+    """Landmarks that determine no pose: too few, or in places that span no space. The file is an avatar."""
+    landmarks = np.random.default_rng(0).random((LANDMARKS, 3))
+    if known in ("none", "five"):
+        landmarks[{"none": 0, "five": 5}[known] :] = np.nan
+    else:
+        landmarks[:, {"one place": 0, "a plane": 2}[known] :] = 0.5
+    prior = load_prior()
+    save_avatar(tmp_path / "a", dataclasses.replace(avatar.with_tensors(landmarks=landmarks), skin=prior.skin))
+    assert load_avatar(tmp_path / "a").skin == prior.skin
+    with pytest.raises(InputError, match="is no prior") as caught:
+        load_prior(tmp_path / "a")
+    assert "\n" not in str(caught.value) and str(tmp_path / "a") in str(caught.value)
 
 
 def test_a_refined_light_comes_back_and_may_be_missing(avatar, tmp_path):
@@ -110,7 +128,7 @@ def test_a_head_without_deformation_is_refused_and_an_older_file_opens(avatar, t
 
 
 def test_a_missing_file_and_a_folder(tmp_path):
-    assert "No such file" in complaint(tmp_path / "none.safetensors")
+    assert "no such avatar file" in complaint(tmp_path / "none.safetensors")
     complaint(tmp_path)
 
 
@@ -190,6 +208,7 @@ def test_a_file_without_a_description(avatar, tmp_path):
         ("lobes", np.zeros((4, 6), np.float32)),
         ("lobes", np.zeros((5000, 7), np.float32)),
         ("landmarks", np.zeros((5, 3), np.float32)),
+        ("landmarks", np.full((LANDMARKS, 3), np.inf, np.float32)),
     ],
 )
 def test_wrong_tensors(avatar, tmp_path, name, value):

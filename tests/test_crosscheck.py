@@ -84,10 +84,10 @@ def test_the_command_writes_page_picture_and_figures(avatar_path, tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"avatar": "missing"}, "does not exist"),
+        ({"avatar": "missing"}, "no such avatar file"),
         ({"avatar": "damaged"}, "damaged or not a safetensors file"),
         ({"avatar": "no surface"}, "no surface"),
-        ({"--lights": "missing.json"}, "cannot be read"),
+        ({"--lights": "missing.json"}, "no such light file"),
         ({"--size": "4"}, "--size is 4"),
         ({"--spp": "1"}, "--spp is 1"),
         ({"--spp": "many"}, "invalid int value"),

@@ -16,7 +16,13 @@ from sira_mi.errors import InputError  # noqa: E402
 from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
 from sira_mi.files import write_exr  # noqa: E402
 from sira_mi.sg import lights_io  # noqa: E402
-from sira_mi.sg.fit_environment import render_environment, total_light  # noqa: E402
+from sira_mi.sg.fit_environment import (  # noqa: E402
+    EnvironmentFit,
+    fit_environment,
+    pixel_directions,
+    render_environment,
+    total_light,
+)
 from sira_mi.sg.lobes import evaluate_lobes  # noqa: E402
 
 LOBES = np.array(
@@ -100,6 +106,37 @@ def test_agrees_with_mitsubas_envmap():
         reference = mi.load_dict({"type": "envmap", "bitmap": image, **extra})
         expected = radiance(reference, directions)
         assert np.abs(radiance(emitter(**extra), directions) - expected).max() < 0.01 * expected.max()
+
+
+@pytest.mark.parametrize("height, width", [(3, 6), (5, 10), (16, 32), (33, 60)])
+def test_pixels_lie_where_mitsubas_envmap_has_them(height, width):
+    """Every pixel has its direction, and every row its light, the poles included."""
+    columns = width * np.arange(1, height + 1)[:, None] + np.arange(width)
+    image = np.repeat(columns[..., None], 3, axis=-1).astype(np.float32)
+    directions, solid_angle = pixel_directions(height, width)
+    light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
+    seen = radiance(light, directions[1:-1].reshape(-1, 3))[:, 0]
+    np.testing.assert_allclose(seen, image[1:-1, :, 0].ravel(), rtol=2e-4)
+    assert np.allclose(directions[[0, -1]], np.array([0, 1, 0]) * [[[1]], [[-1]]], atol=1e-12)
+    assert solid_angle.sum() * width == pytest.approx(4 * np.pi, rel=1e-12)
+    everywhere = fibonacci_directions(1 << 17)
+    for row in {0, 1, height // 2, height - 1}:
+        image = np.zeros((height, width, 3), np.float32)
+        image[row] = 3
+        light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
+        expected = 4 * np.pi * radiance(light, everywhere).mean(axis=0, dtype=np.float64)
+        np.testing.assert_allclose(total_light(image), expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("row", [0, 1, 14])
+def test_lobes_of_an_image_lit_near_a_pole_carry_its_light(row):
+    image = np.zeros((16, 32, 3), np.float32)
+    image[row] = 100
+    directions = fibonacci_directions(1 << 16)
+    lobes = mi.TensorXf(fit_environment(image, EnvironmentFit(lobes=16)))
+    lights = {"type": "envmap", "bitmap": mi.Bitmap(image)}, {"type": "sg_envmap", "lobes": lobes}
+    traced, fitted = (radiance(mi.load_dict(light), directions).mean(axis=0, dtype=np.float64) for light in lights)
+    np.testing.assert_allclose(fitted, traced, rtol=0.01)
 
 
 @pytest.mark.slow
@@ -201,17 +238,17 @@ GOOD = '{"axis": [0, 1, 0], "sharpness": 5, "amplitude": [1, 1, 1]}'
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("", "not a JSON"),
-        ("[" * 100_000, "not a JSON"),
+        ("", "empty file"),
+        ("[" * 100_000, "not JSON"),
         ("[]", 'list "lobes"'),
         ('{"lobes": []}', "0 lobes"),
         ('{"lobes": [' + ",".join([GOOD] * 4097) + "]}", "4097 lobes"),
         (f'{{"lobes": [{GOOD}, 7]}}', "lobe 1"),
         (f'{{"lobes": [{GOOD}, {GOOD.replace("5", "0")}]}}', "lobe 1 has a sharpness"),
         (f'{{"lobes": [{GOOD}, {GOOD.replace("5", "1e-60")}]}}', "lobe 1 has a sharpness"),
-        (f'{{"lobes": [{GOOD.replace("5", "NaN")}]}}', '"sharpness" must hold finite'),
+        (f'{{"lobes": [{GOOD.replace("5", "NaN")}]}}', "NaN or infinity (NaN)"),
         (f'{{"lobes": [{GOOD.replace("5", "1e60")}]}}', "lobe 0 has a value that is not finite"),
-        (f'{{"lobes": [{GOOD.replace("5", "true")}]}}', '"sharpness" must hold finite'),
+        (f'{{"lobes": [{GOOD.replace("5", "true")}]}}', '"sharpness" must hold numbers'),
         (f'{{"lobes": [{GOOD.replace("[1, 1, 1]", "[1, -1, 1]")}]}}', "negative amplitude"),
         (f'{{"lobes": [{GOOD.replace("[0, 1, 0]", "[0, 0, 0]")}]}}', "axis of zero length"),
         (f'{{"lobes": [{GOOD.replace("[0, 1, 0]", "[0, 1]")}]}}', '"axis" must be 3 numbers'),
@@ -232,7 +269,7 @@ def test_bad_environment_files_are_named(tmp_path):
         with pytest.raises(InputError, match=fault):
             lights_io.read_environment(path)
 
-    expect("no such file")
+    expect("no such light file")
     path.write_bytes(b"not an image")
     expect("not a readable OpenEXR")
     write_exr(path, np.ones((16, 32, 3)))
@@ -262,5 +299,5 @@ def test_unwritable_output_leaves_nothing(tmp_path):
     "extra", [{"lobes": mi.TensorXf(LOBES), "filename": "a.json"}, {"filename": "a.png"}, {"filename": "missing.json"}]
 )
 def test_bad_emitter_parameters_are_errors(extra):
-    with pytest.raises(Exception, match=r"either lobes or filename|reads .json and .exr|cannot be read"):
+    with pytest.raises(Exception, match=r"either lobes or filename|reads .json and .exr|no such light file"):
         mi.load_dict({"type": "sg_envmap", **extra})

@@ -17,9 +17,9 @@ from safetensors.numpy import save
 
 from sira_mi.avatar.architecture import AvatarArchitecture
 from sira_mi.avatar.skin_tone import SkinPrior
-from sira_mi.conventions import LANDMARKS
+from sira_mi.conventions import LANDMARKS, LEAST_LANDMARKS
 from sira_mi.errors import InputError
-from sira_mi.files import write_through
+from sira_mi.files import check_file, parse_json, write_through
 
 FORMAT = "sira-mi avatar 1"
 PRIOR = Path(__file__).with_name("prior.safetensors")
@@ -90,10 +90,8 @@ def load_avatar(path: str | Path | None = None) -> Avatar:
     """Reads an avatar or prior file; without a path, the prior shipped with the package.
 
     Raises InputError for a file that is missing, damaged, of another kind, or holds values that are not finite."""
-    path = Path(path) if path else PRIOR
+    path = check_file(path or PRIOR, "avatar", _MAXIMUM_BYTES)
     try:
-        if path.stat().st_size > _MAXIMUM_BYTES:
-            raise InputError(f"{path} is larger than any avatar; give an avatar.safetensors written by sira_mi")
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
@@ -105,12 +103,12 @@ def load_avatar(path: str | Path | None = None) -> Avatar:
     except (SafetensorError, TypeError) as error:
         raise InputError(f"{path} is damaged or not a safetensors file: {error}") from error
     try:
-        description = json.loads(metadata["avatar"])
+        description = parse_json(metadata["avatar"], f"the description in {path}")
         architecture = AvatarArchitecture.from_dict(description["architecture"], path)
         scalars = {name: float(description[name]) for name in ("roughness", "k_s", "k_r")}
         avatar = Avatar(architecture, tensors, **scalars, skin=_read_skin(description.get("skin")))
         _check(avatar)
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged: {error}") from error
     return avatar
 
@@ -124,10 +122,17 @@ def _read_skin(stored: dict | None) -> SkinPrior | None:
 
 
 def load_prior(path: str | Path | None = None) -> Avatar:
-    """`load_avatar` for a prior to fit with. Raises InputError for one of an earlier version, which does not say what
-    it expects of skin, too."""
+    """`load_avatar` for a prior to fit with. Raises InputError, too, for one of an earlier version, which does not say
+    what it expects of skin, and for an avatar without the landmarks that place it in a photo."""
     prior = load_avatar(path)
     prior.skin_prior()
+    landmarks = prior.tensors["landmarks"].astype(np.float64)
+    known = landmarks[np.isfinite(landmarks).all(axis=1)]
+    if len(known) < LEAST_LANDMARKS or np.linalg.matrix_rank(known - known.mean(axis=0)) < 3:
+        raise InputError(
+            f"{path} is no prior: it places {len(known)} of {LANDMARKS} landmarks, and at least {LEAST_LANDMARKS} that "
+            "span a face are needed"
+        )
     return prior
 
 
@@ -151,7 +156,7 @@ def _check(avatar: Avatar) -> None:
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.float32:
             raise ValueError(f"tensor {name} is {tensor.dtype}{list(tensor.shape)}, float32{list(shape)} expected")
-        if name != "landmarks" and not np.isfinite(tensor).all():
+        if not np.isfinite(tensor).all() and (name != "landmarks" or np.isinf(tensor).any()):
             raise ValueError(f"tensor {name} has values that are not finite")
     if extra := set(tensors) - set(due):
         raise ValueError(f"unknown tensors {sorted(extra)}")

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from sira_mi.errors import InputError
 from sira_mi.fields.extraction import EmptySurfaceError
+from sira_mi.files import parse_json
 from sira_mi.fit.stage import Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation.adam import (
@@ -80,7 +81,7 @@ def load_progress(path: Path, identity: str) -> Progress:
         )
     try:
         optimizer = {k.removeprefix("adam/"): v for k, v in arrays.items() if k.startswith("adam/")}
-        description = json.loads(metadata["progress"])
+        description = parse_json(metadata["progress"], f"the progress in {path}")
         return Progress(FitState.from_arrays(arrays), optimizer=optimizer or None, **description)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged ({error}); remove it to start again") from error

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from sira_mi.export.scene import head, head_scene, orbit, sensor, sg_light
-from sira_mi.files import write_exr, write_png, write_through
+from sira_mi.files import write_exr, write_png, write_text
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait
@@ -122,5 +122,6 @@ def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 
 def write_report(path: Path, report: dict) -> None:
-    """Writes `avatar.json`."""
-    write_through(path, lambda p: p.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8"))
+    """Writes `avatar.json`; null stands for numbers that are not finite, which JSON lacks."""
+    finite = json.loads(json.dumps(report), parse_constant=lambda name: None)
+    write_text(path, json.dumps(finite, indent=2) + "\n")

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from sira_mi.conventions import LANDMARKS, MILLIMETRES_PER_UNIT
+from sira_mi.conventions import LANDMARKS, LEAST_LANDMARKS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.files import parse_json
 from sira_mi.portrait.landmarks import BROWS, JAW, MOUTH, OVAL, RIGID
 
 _FILM_DIAGONAL = 43.2666  # mm, of the 36 mm x 24 mm frame that EXIF's 35 mm focal length refers to
@@ -79,11 +80,7 @@ class Camera:
 
         Raises `InputError` that names the first defect found.
         """
-        try:
-            data = json.loads(text)
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise InputError(f"{source} is not JSON: {error}") from None
-        return Camera.from_dict(data, source, size)
+        return Camera.from_dict(parse_json(text, source), source, size)
 
     @staticmethod
     def from_dict(data: Any, source: str = "camera", size: tuple[int, int] | None = None) -> "Camera":
@@ -142,12 +139,13 @@ def estimate_camera(
 
     Square pixels, principal point in the image's middle. Robust Levenberg-Marquardt-type least squares (soft L1)
     from an EPnP start; one face determines focal length and distance together only weakly, so an unknown focal
-    length comes with a log-normal prior on the distance. Raises `ValueError` for fewer than 6 usable landmarks.
+    length comes with a log-normal prior on the distance. Raises `ValueError` for fewer usable landmarks than
+    `LEAST_LANDMARKS`.
     """
     landmarks, head_landmarks = np.asarray(landmarks, np.float64), np.asarray(head_landmarks, np.float64)
     usable = np.isfinite(landmarks).all(axis=1) & np.isfinite(head_landmarks).all(axis=1)
-    if usable.sum() < 6:
-        raise ValueError(f"{usable.sum()} landmarks are known on both sides: 6 are needed")
+    if usable.sum() < LEAST_LANDMARKS:
+        raise ValueError(f"{usable.sum()} landmarks are known on both sides: {LEAST_LANDMARKS} are needed")
     weights = weigh_landmarks(len(landmarks))[usable]
     points, pixels = head_landmarks[usable], landmarks[usable]
     known_focal = None if focal_35mm is None else convert_exif_focal(focal_35mm, width, height)

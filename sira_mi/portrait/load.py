@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageCms
 
 from sira_mi.errors import InputError
-from sira_mi.files import read_exr
+from sira_mi.files import check_file, read_exr
 
 MIN_SIDE = 32  # pixels; anything smaller holds no face that could be fitted
 MAX_FILE_PIXELS = 400_000_000
@@ -71,8 +71,7 @@ def load_photo(path: str | Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
     A photo of more than `max_pixels` is reduced by a power of two, averaging in linear light.
     Raises `InputError` for any other file.
     """
-    path = Path(path)
-    _check_file(path, "photo")
+    path = check_file(path, "photo")
     photo = _load(path, max_pixels, srgb_to_linear)
     height, width = photo.image.shape[:2]
     if photo.reduction > 1:
@@ -87,8 +86,7 @@ def load_grey(path: str | Path, max_pixels: int) -> tuple[np.ndarray, tuple[int,
     Returns the mask `[H, W]` float32 in [0, 1] after the file's own EXIF orientation and reduction, the full size
     (width, height) after orientation, and the reduction. Raises `InputError` as `load_photo` does.
     """
-    path = Path(path)
-    _check_file(path, "mask")
+    path = check_file(path, "mask")
     photo = _load(path, max_pixels, _as_stored)
     grey = photo.image.mean(axis=2)
     if photo.alpha is not None and np.ptp(photo.alpha) > 0:
@@ -104,20 +102,6 @@ def _load(path: Path, max_pixels: int, decode: Callable) -> Photo:
     with _quiet_decoders():
         is_exr = _head(path) == _EXR_MAGIC
         return _load_exr(path, max_pixels) if is_exr else _load_coded(path, max_pixels, decode)
-
-
-def _check_file(path: Path, what: str) -> None:
-    try:
-        if path.is_dir():
-            raise InputError(f"{path} is a folder: give a {what} file")
-        if not path.is_file():
-            raise InputError(f"{path}: no such {what} file")
-        if path.stat().st_size == 0:
-            raise InputError(f"{path} is an empty file: give a {what}")
-        with path.open("rb"):
-            pass
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
 
 def _head(path: Path) -> bytes:

@@ -8,6 +8,7 @@ from scipy.sparse import csr_matrix
 
 from sira_mi.conventions import LANDMARKS, LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
+from sira_mi.files import read_json
 from sira_mi.portrait.camera import Camera, estimate_camera, measure_reprojection_error
 from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.head_landmarks import correct_landmarks
@@ -159,13 +160,7 @@ def _area_weights(old: int, start: float, scale: float, new: int) -> csr_matrix:
 
 def _read_camera(path: str | Path, photo: Photo) -> Camera:
     """A camera file for the photo's full resolution, as the camera of `photo.image`."""
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not a camera file: it should be JSON text") from None
-    camera = Camera.from_json(text, str(path), photo.full_size)
+    camera = Camera.from_dict(read_json(path, "camera"), str(path), photo.full_size)
     height, width = photo.image.shape[:2]
     return camera.scale(1 / photo.reduction, 1 / photo.reduction, width, height)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from sira_mi.avatar.file import Avatar, load_avatar
 from sira_mi.errors import InputError
+from sira_mi.files import read_json
 from sira_mi.portrait.camera import Camera
 from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
 from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
@@ -75,25 +76,19 @@ def read_subject(path: Path, size: int | None = None) -> Subject:
     or else `PORTRAIT_CAMERA`; scaled so that its longer side has `size` pixels.
 
     Raises InputError for a file that is missing, damaged or of another kind."""
-    file = path / "avatar.safetensors" if path.is_dir() else path
-    if not file.is_file():
-        what = f"{path} holds no avatar.safetensors" if path.is_dir() else f"{path} does not exist"
-        raise InputError(f"{what}; give the output folder of a fit, or an avatar.safetensors")
+    file = path
+    if os.path.isdir(path):  # other than Path.is_dir, False for a name that is too long
+        file = path / "avatar.safetensors"
+        if not file.exists():
+            raise InputError(f"{path} holds no avatar.safetensors; give the output folder of a fit")
     avatar = load_avatar(file)
     report = file.with_name("avatar.json")
-    subject = Subject(file, avatar, _read_camera(report) if report.is_file() else PORTRAIT_CAMERA)
+    subject = Subject(file, avatar, _read_camera(report) if report.exists() else PORTRAIT_CAMERA)
     return subject if size is None else subject.resize(size)
 
 
 def _read_camera(report: Path) -> Camera:
-    try:
-        if report.stat().st_size > _MAXIMUM_REPORT_BYTES:
-            raise InputError(f"{report} is larger than any report of a fit")
-        data = json.loads(report.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {report}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{report} is damaged, not JSON: {error}") from error
+    data = read_json(report, "report of a fit", _MAXIMUM_REPORT_BYTES)
     if not isinstance(data, dict) or "camera" not in data:
         raise InputError(f"{report} holds no camera; without that file, a portrait camera is used")
     return Camera.from_dict(data["camera"], f"the camera in {report}")

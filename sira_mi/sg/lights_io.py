@@ -4,18 +4,16 @@
 """
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 
 from sira_mi.errors import InputError
-from sira_mi.files import read_exr, write_through
+from sira_mi.files import check_file, read_exr, read_json, write_through
 
 MAXIMUM_LOBES = 4096
 # Width and height of an environment image that is still read.
 _MAXIMUM_SIDE = 32768
-_MAXIMUM_JSON_BYTES = 4 << 20
 _FIELDS = (("axis", 3), ("sharpness", 1), ("amplitude", 3))
 
 
@@ -47,22 +45,14 @@ def _numbers(entry, key, count, source):
     values = value if count > 1 else [value]
     if not isinstance(values, list) or len(values) != count:
         raise InputError(f'{source}: "{key}" must be {"a number" if count == 1 else f"{count} numbers"}')
-    if any(isinstance(x, bool) or not isinstance(x, int | float) or not math.isfinite(x) for x in values):
-        raise InputError(f'{source}: "{key}" must hold finite numbers')
+    if any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
+        raise InputError(f'{source}: "{key}" must hold numbers')
     return [float(x) for x in values]
 
 
 def read_lights(path: str | Path) -> np.ndarray:
     """Lobes `[N_l, 7]` (float32, unit axes) of a `lights.json`; InputError for anything else."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > _MAXIMUM_JSON_BYTES:
-            raise InputError(f"{path}: larger than a file of {MAXIMUM_LOBES} lobes can be")
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a JSON file ({error})") from error
+    document = read_json(path, "light")
     entries = document.get("lobes") if isinstance(document, dict) else None
     if not isinstance(entries, list):
         raise InputError(f'{path}: there must be a list "lobes"')
@@ -87,13 +77,12 @@ def write_lights(path: str | Path, lobes: np.ndarray) -> None:
 
 def read_environment(path: str | Path) -> np.ndarray:
     """Radiance `[H, W, 3]` (float32) of a latitude-longitude OpenEXR; InputError unless it is finite and about 2:1."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    path = check_file(path, "light")
 
     def check_size(width: int, height: int) -> None:
         if max(height, width) > _MAXIMUM_SIDE or height < 2 or not 1.8 <= width / height <= 2.2:
             raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
 
     image, _ = read_exr(path, check_size)
+    return np.maximum(image, 0.0)
     return np.maximum(image, 0.0)

@@ -4,7 +4,6 @@ Albedo truth is in the scene files too, but is not loaded here: training never s
 `HELD_OUT_VIEWS`, on which renderings are compared.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -13,7 +12,9 @@ import numpy as np
 
 from sira_mi.conventions import HELD_OUT_VIEWS
 from sira_mi.errors import InputError
+from sira_mi.files import read_json
 
+_MAXIMUM_MANIFEST_BYTES = 64 << 20
 _ARRAYS = (
     "points",
     "normals",
@@ -77,7 +78,7 @@ def load_scene(path: Path) -> TrainingScene:
 def load_training_scenes(folder: Path) -> list[TrainingScene]:
     """All scenes of the manifest's training split. Raises InputError when there are fewer than two."""
     try:
-        manifest = json.loads((folder / "manifest.json").read_text())
+        manifest = read_json(folder / "manifest.json", "manifest of a collection", _MAXIMUM_MANIFEST_BYTES)
         names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train" and "error" not in scene]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
