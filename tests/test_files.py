@@ -11,7 +11,8 @@ from PIL import Image
 from sira_mi.avatar.file import PRIOR, load_avatar, load_prior
 from sira_mi.errors import InputError
 from sira_mi.files import check_file, parse_json, read_json
-from sira_mi.portrait import load_mask, load_photo
+from sira_mi.portrait.load import load_photo
+from sira_mi.portrait.mask import load_mask
 from sira_mi.portrait.portrait import _read_camera
 from sira_mi.relight.subject import read_light, read_subject
 from sira_mi.sg.lights_io import read_environment, read_lights

@@ -85,4 +85,3 @@ def read_environment(path: str | Path) -> np.ndarray:
 
     image, _ = read_exr(path, check_size)
     return np.maximum(image, 0.0)
-    return np.maximum(image, 0.0)
