@@ -1,11 +1,17 @@
 """The exception for input that the user can correct. Commands print its message as one line and exit with code 2."""
 
 import argparse
+import atexit
+import io
+import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
+
+from sira_mi.interrupts import INTERRUPTED, handle_interrupts, was_interrupted
 
 
 class InputError(Exception):
@@ -36,12 +42,42 @@ def check_writable(folder: Path) -> None:
 
 def run_command(main: Callable[[], int | None]) -> None:
     """Runs a command's `main` and exits: with its return value or 0, with 2 and one line on stderr for an InputError,
-    with 130 when the user interrupts it."""
-    try:
-        sys.exit(main() or 0)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+    with 130 when the user interrupts it. Works without standard streams, and where they hold ASCII only."""
+    _open_streams()
+    with handle_interrupts():
+        try:
+            code = main() or 0
+            sys.stdout.flush()
+        except BrokenPipeError:  # who reads the output wants no more of it
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            code = 1
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) or was_interrupted():
+                code = _end("interrupted", INTERRUPTED)
+            elif isinstance(error, InputError):
+                code = _end(f"error: {error}", 2)
+            else:
+                raise
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # until all libraries have shut down
+    sys.exit(code)
+
+
+def _end(message: str, code: int) -> int:
+    print(message, file=sys.stderr)
+    return code
+
+
+def _open_streams() -> None:
+    """Opens the standard streams that the process was started without on the null device, so that no file of the
+    command gets their descriptors; characters that a stream cannot encode are written as escapes."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  (as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")

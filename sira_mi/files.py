@@ -1,16 +1,21 @@
 """Checks and reads a user's files; writes files whole or not at all; the image formats of the project."""
 
+import contextlib
 import json
 import math
 import os
 import stat
-from collections.abc import Callable
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
+from filelock import FileLock, Timeout
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from sira_mi.colour import REC_709, convert_to_rec709
 from sira_mi.errors import InputError
@@ -18,15 +23,23 @@ from sira_mi.errors import InputError
 MAX_EXR_PIXELS = 1 << 29  # of all parts together
 # Of a JSON file, unless its reader says otherwise.
 _MAXIMUM_JSON_BYTES = 4 << 20
+# How the names of temporary files begin; the number of the process follows.
+_TEMPORARY = ".sira_mi."
+_LOCK = ".lock"
+# What pictures name as the software that wrote them, in the first bytes of their files.
+_SOFTWARE = "sira_mi relightable heads"
+_HEADER_BYTES = 4096
 
 
 def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
     """Calls `write` with a temporary path beside `path` that has the same suffix, then renames the file.
 
-    Raises InputError when the folder cannot be written or the disk is full; the temporary file is removed."""
+    Raises InputError when the folder cannot be written or the disk is full; the temporary file is removed, and so are
+    those of processes that have been killed."""
     path = Path(path)
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    temporary = path.with_name(f"{_TEMPORARY}{os.getpid()}.{threading.get_ident()}{path.suffix}")
     try:
+        _remove_leftovers(path.parent)
         write(temporary)
         os.replace(temporary, path)
     except OSError as error:
@@ -34,7 +47,88 @@ def write_through(path: str | Path, write: Callable[[Path], object]) -> None:
             f"cannot write {path}: {error.strerror or error}; choose another place or free some"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Removes the temporary files of processes that run no more."""
+    for file in folder.glob(f"{_TEMPORARY}*"):
+        process = file.name.removeprefix(_TEMPORARY).split(".")[0]
+        if process.isdecimal() and not _is_running(int(process)):
+            with contextlib.suppress(OSError):  # open in another process, on Windows, or not of this user
+                file.unlink()
+
+
+def _is_running(process: int) -> bool:
+    """On Windows, which does not remove open files, always False except for this process."""
+    if os.name == "nt" or process == os.getpid():
+        return process == os.getpid()
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Makes `folder` and holds it until the block or the process ends, however that ends. At the end it removes the
+    folders that it has made, and that are still empty.
+
+    Raises InputError when another run holds it, or when it cannot be made or written."""
+    made = [place for place in (folder, *folder.parents) if not os.path.lexists(place)]
+    lock = FileLock(folder / _LOCK)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise InputError(f"another run is writing to {folder}; wait for its end, or choose another --out") from None
+    except NotImplementedError:
+        print(f"note: the disk of {folder} knows no locks; start no second run there", file=sys.stderr)
+    except OSError as error:
+        raise InputError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+    try:
+        yield
+    finally:
+        lock.release()
+        with contextlib.suppress(OSError):
+            (folder / _LOCK).unlink()
+            for place in made:
+                place.rmdir()
+
+
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Raises InputError when a file of `outputs` is one of `inputs`, a folder, or has a name that no file can have."""
+    read = [path for path in inputs if path is not None and path.exists()]
+    for output in outputs:
+        try:
+            output.lstat()
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise InputError(f"cannot write {output}: {error.strerror}; choose another --out") from error
+        if output.is_dir():
+            raise InputError(f"{output} is a folder, and a file is to be written there; choose another --out")
+        if any(output.samefile(path) for path in read if output.exists()):
+            raise InputError(f"{output} is an input, and would be overwritten; choose another --out")
+
+
+def check_own(pictures: Iterable[Path]) -> None:
+    """Raises InputError when a file of `pictures` is there and was not written by `write_png` or `write_exr`: it may be
+    the user's photo or environment."""
+    for path in pictures:
+        try:
+            with path.open("rb") as file:
+                own = _SOFTWARE.encode() in file.read(_HEADER_BYTES)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            raise InputError(f"cannot replace {path}: {error.strerror}; choose another --out") from error
+        if not own:
+            raise InputError(f"{path} is no picture of this program, and would be overwritten; choose another --out")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -188,7 +282,7 @@ def _place(pixels: np.ndarray, header: dict) -> np.ndarray:
 def write_exr(path: str | Path, image: np.ndarray) -> None:
     """Writes a 32-bit OpenEXR file of an image [H, W, 3] (channels RGB) or [H, W] (channel Y)."""
     pixels = np.ascontiguousarray(image, np.float32)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "software": _SOFTWARE}
 
     def write(file: Path) -> None:
         try:
@@ -203,4 +297,6 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
 def write_png(path: str | Path, values: np.ndarray) -> None:
     """Writes a PNG file of display values in [0, 1], [H, W, 3] or [H, W]."""
     picture = Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
-    write_through(path, lambda file: picture.save(file, format="PNG"))
+    header = PngInfo()
+    header.add_text("Software", _SOFTWARE)
+    write_through(path, lambda file: picture.save(file, format="PNG", pnginfo=header))

@@ -18,6 +18,7 @@ from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import parse_json
 from sira_mi.fit.stage import Problem, Stage
 from sira_mi.fit.state import FitState
+from sira_mi.interrupts import check_interrupt, postpone_interrupts
 from sira_mi.optimisation.adam import (
     adam,
     cosine_fall,
@@ -96,17 +97,20 @@ def run_stages(
     checkpoint: Callable[[Progress], None],
 ) -> Progress:
     """Runs every stage from where `progress` stands, which follows; `make_problem` gives the problem of a stage from a
-    state on. On KeyboardInterrupt the parameters so far are kept and the exception goes on.
+    state on. Ctrl-C ends it between two steps: a checkpoint is written, `progress` gets the parameters so far, and
+    KeyboardInterrupt is raised.
 
     A block that diverges (`_run_block`) is undone: the stage goes on from the last block that went well, at half the
     learning rates, and a note says so. Raises InputError when that does not help."""
     run = _Run(progress, block, seed, checkpoint)
     total, done = (sum(stage.steps for stage in some) for some in (stages, stages[: progress.stage]))
-    with tqdm(total=total, initial=done + progress.step, desc="fit", unit="step", mininterval=1, smoothing=0.05) as bar:
+    bar = tqdm(total=total, initial=done + progress.step, desc="fit", unit="step", mininterval=1, smoothing=0.05)
+    with postpone_interrupts(), bar:
         for stage in stages[progress.stage :]:
             _run_stage(run, stage, make_problem(stage, progress.state), bar, done)
             done += stage.steps
             progress.finish_stage()
+        run.checkpoint(progress)
         bar.set_postfix_str("done")
     return progress
 
@@ -152,6 +156,9 @@ def _run_stage(run: _Run, stage: Stage, problem: Problem, bar: tqdm, done: int) 
                 progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
                 started = run.saved = time.monotonic()
                 run.checkpoint(progress)
+    except KeyboardInterrupt:
+        run.checkpoint(progress)
+        raise
     finally:
         progress.state = progress.state.with_parameters(parameter_values(optimizer))
         progress.seconds[stage.name] = progress.seconds.get(stage.name, 0) + time.monotonic() - started
@@ -175,6 +182,7 @@ def _run_block(
     problem.refresh(state)
     totals: list[float] = []
     for step in steps:
+        check_interrupt()
         rng = np.random.default_rng([seed, progress.stage, step])
         terms = _step(problem, optimizer, stage, step, 0.5**progress.rollbacks, rng)
         totals.append(sum(terms.values()))

@@ -1,5 +1,6 @@
 """A whole fit: photo -> portrait -> geometry -> appearance -> avatar folder."""
 
+import contextlib
 import hashlib
 import json
 import sys
@@ -20,7 +21,7 @@ from sira_mi.decisions import explain
 from sira_mi.errors import InputError
 from sira_mi.export.mesh import write_mesh
 from sira_mi.export.scene_file import write_scene
-from sira_mi.files import write_exr, write_png, write_through
+from sira_mi.files import check_outputs, hold_folder, write_exr, write_png
 from sira_mi.fit import output
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.measure import measure_fit
@@ -31,6 +32,7 @@ from sira_mi.fit.settings import QUALITIES, polish_stage
 from sira_mi.fit.shaded import decode_lobes
 from sira_mi.fit.stage import FitSettings, FitTask
 from sira_mi.fit.state import initial_state
+from sira_mi.interrupts import INTERRUPTED
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 from sira_mi.relight.pictures import preview, psnr_inside
 from sira_mi.sg.fit_environment import render_environment
@@ -41,8 +43,19 @@ from sira_mi.variants import set_variant
 _WORK = ".fit"
 # A head of fewer foreground pixels cannot be fitted.
 _LEAST_PIXELS = 200
-# Of a process that an interrupt has ended.
-_INTERRUPTED = 130
+_CHECKPOINT = "checkpoint.safetensors"
+# What a fit leaves in its output folder.
+_OUTPUTS = (
+    "avatar.json",
+    "avatar.safetensors",
+    "contact.png",
+    "input.png",
+    "lights.exr",
+    "lights.json",
+    "mesh.ply",
+    "renders",
+    "scene.xml",
+)
 
 
 @dataclass(frozen=True)
@@ -71,11 +84,26 @@ def fit_photo(request: FitRequest) -> int:
     Raises InputError for anything wrong with the photo, the options or the output folder."""
     started = time.monotonic()
     set_variant(request.variant)
-    task = prepare_fit(request)
+    check_folder(request)
+    work = request.out / _WORK
+    with hold_folder(work):
+        complete = _fit_in_folder(request, work, started)
+    if complete:
+        with contextlib.suppress(OSError):  # another fit may have begun
+            work.rmdir()
+    return 0 if complete else INTERRUPTED
+
+
+def _fit_in_folder(request: FitRequest, work: Path, started: float) -> bool:
+    """Fits and writes the folder; returns whether the fit is complete."""
+    if note := describe_start(request.out, request.resume):
+        print(f"note: {note}", file=sys.stderr)
+    task = prepare_fit(request, work)
     seconds_portrait = time.monotonic() - started
 
     progress, complete = run_fit(request, task)
     avatar = assemble_avatar(task.prior, progress, task.settings)
+    save_avatar(request.out / "avatar.safetensors", avatar)
     report = {
         "quality": request.quality,
         "seed": request.seed,
@@ -94,12 +122,36 @@ def fit_photo(request: FitRequest) -> int:
         report["polish"] = measure_polish(task, polish_stage(), progress.state)
     write_folder(request.out, task.pose_portrait(progress.state), avatar, task.settings, report, started)
     if complete:
-        remove_folder(task.folder)
-    return 0 if complete else _INTERRUPTED
+        (work / _CHECKPOINT).unlink()
+    return complete
 
 
-def prepare_fit(request: FitRequest) -> FitTask:
-    """Settings, prior and portrait of a request, and the folder for its files in between. Raises InputError."""
+def check_folder(request: FitRequest) -> None:
+    """Raises InputError when the fit would overwrite one of its inputs, or files in the output folder that are of no
+    fit."""
+    out, inputs = request.out, (request.photo, request.mask, request.camera, request.prior)
+    files = [out / name for name in _OUTPUTS if name != "renders"]
+    check_outputs([*files, *(out / "renders" / path.name for path in inputs if path is not None)], inputs)
+    there = [name for name in _OUTPUTS if (out / name).exists()]
+    if there and "avatar.json" not in there and not (out / _WORK).is_dir():
+        raise InputError(
+            f"{out} is no folder of a fit and has files that would be overwritten: {', '.join(there)}; choose another "
+            "--out"
+        )
+
+
+def describe_start(out: Path, resume: bool) -> str | None:
+    """What the user should know about where a fit starts, None where that is plain."""
+    checkpoint = (out / _WORK / _CHECKPOINT).exists()
+    if resume and not checkpoint:
+        return f"{out} has no checkpoint to resume from; the fit starts at its beginning"
+    if checkpoint and not resume:
+        return f"{out} has the checkpoint of an unfinished fit; this fit starts anew and will replace it (see --resume)"
+    return None
+
+
+def prepare_fit(request: FitRequest, work: Path) -> FitTask:
+    """Settings, prior and portrait of a request; `work` is for its files in between. Raises InputError."""
     settings = QUALITIES[request.quality]
     if request.camera is not None:
         settings = settings.hold("pose")
@@ -111,13 +163,13 @@ def prepare_fit(request: FitRequest) -> FitTask:
     for note in portrait.notes:
         print(f"note: {note}", file=sys.stderr)
     plan = settings.plan().keep_all() if request.keep_all else settings.plan()
-    return FitTask(portrait, prior, prior_path, settings, prepare_folder(request.out), plan)
+    return FitTask(portrait, prior, prior_path, settings, work, plan)
 
 
 def run_fit(request: FitRequest, task: FitTask) -> tuple[Progress, bool]:
     """Runs the stages from their start, or from the checkpoint where the request says so. Returns the progress, and
     whether they are complete: after an interrupt they are not, and an unfinished polish is undone."""
-    checkpoint = task.folder / "checkpoint.safetensors"
+    checkpoint = task.folder / _CHECKPOINT
     identity = identify(task, request.seed)
     if request.resume and checkpoint.exists():
         progress = load_progress(checkpoint, identity)
@@ -127,7 +179,7 @@ def run_fit(request: FitRequest, task: FitTask) -> tuple[Progress, bool]:
     try:
         fit_portrait(task, progress, request.seed, lambda p: save_progress(checkpoint, p, identity))
     except KeyboardInterrupt:
-        print("interrupted: writing what there is; --resume goes on from the last checkpoint", file=sys.stderr)
+        print("interrupted: writing what there is; --resume goes on", file=sys.stderr)
         progress.state = progress.state.before_polish()
         return progress, False
     return progress, True
@@ -141,25 +193,6 @@ def fit_portrait(
     run_stages(
         settings.stages, lambda stage, state: stage.problem(task, state), progress, settings.block, seed, checkpoint
     )
-
-
-def prepare_folder(out: Path) -> Path:
-    """Makes the output folder and its work folder, and checks that files can be written there."""
-    work = out / _WORK
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the output folder {out}: {error.strerror}; choose another --out") from error
-    write_through(work / "probe", lambda file: file.write_bytes(b"0"))
-    (work / "probe").unlink()
-    return work
-
-
-def remove_folder(work: Path) -> None:
-    """Removes the work folder of a finished fit."""
-    for file in work.iterdir():
-        file.unlink()
-    work.rmdir()
 
 
 def read_portrait(request: FitRequest, settings: FitSettings, prior: Avatar) -> Portrait:
@@ -214,11 +247,10 @@ def assemble_avatar(prior: Avatar, progress: Progress, settings: FitSettings) ->
 def write_folder(
     out: Path, portrait: Portrait, avatar: Avatar, settings: FitSettings, report: dict, started: float
 ) -> None:
-    """Completes the report and writes everything that a fit leaves behind. The camera of `portrait` sees the head
-    unmoved."""
+    """Completes the report and writes everything that a fit leaves behind beside the avatar file. The camera of
+    `portrait` sees the head unmoved."""
     begun = time.monotonic()
     avatar_path = out / "avatar.safetensors"
-    save_avatar(avatar_path, avatar)
     lobes = avatar.tensors["lobes"]
     write_lights(out / "lights.json", lobes)
     write_exr(out / "lights.exr", render_environment(lobes, 128))

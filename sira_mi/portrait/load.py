@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ DEFAULT_MAX_PIXELS = 26_000_000
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM, _TIFF_WIDTH, _TIFF_HEIGHT = 0x0112, 0x8769, 0xA405, 256, 257
 _FLIPS_X, _FLIPS_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations that reverse the stored x or y axis
+_DECODING = threading.Lock()
 _STRIP_PIXELS = 4_000_000
 _LEAST_ALPHA = 1 / 255  # premultiplied colours of less say nothing
 _GREYS = ("1", "L", "LA", "La", "I;16", "I;16B", "I;16L", "I;16N")
@@ -99,7 +101,7 @@ def _as_stored(values: np.ndarray) -> np.ndarray:
 
 
 def _load(path: Path, max_pixels: int, decode: Callable) -> Photo:
-    with _quiet_decoders():
+    with _DECODING, _quiet_decoders():
         is_exr = _head(path) == _EXR_MAGIC
         return _load_exr(path, max_pixels) if is_exr else _load_coded(path, max_pixels, decode)
 
@@ -128,7 +130,8 @@ def _reduction(width: int, height: int, max_pixels: int) -> int:
 @contextlib.contextmanager
 def _quiet_decoders() -> Iterator[None]:
     """Silences the decoders: Python's warnings, the prints of OpenEXR, and what libtiff and OpenEXR write from C to
-    file descriptor 2. Also lifts Pillow's size limit, which `_check_size` replaces."""
+    file descriptor 2. Also lifts Pillow's size limit, which `_check_size` replaces. All this is the process's: one
+    thread at a time."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import shlex
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,8 +35,16 @@ _SAMPLES = {"path": 64, "sg": 8}
 _MAXIMUM_SIZE = 8192
 _MAXIMUM_SAMPLES = 1 << 20
 _MAXIMUM_FRAMES = 9999
+_COMPARED = ("sg", "path")
 _ENDINGS = (".exr", ".png")
 _OTHER_ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".gif", ".webp", ".hdr", ".mp4")
+
+
+def image_path(text: str) -> Path:
+    """The path of the option `--out`. Raises InputError when it ends as a folder's does."""
+    if text.endswith(("/", os.sep)):
+        raise InputError(f"--out {text} names a folder; add the name of a picture")
+    return Path(text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -50,7 +62,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--spp", type=int, metavar="N", help="samples a pixel (default: 64, and 8 with sg)")
     parser.add_argument("--yaw", type=float, default=0.0, metavar="DEG", help="turns the head to its left (default: 0)")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="IMAGE", help="both files have this name, ending in .exr and .png"
+        "--out",
+        type=image_path,
+        required=True,
+        metavar="IMAGE",
+        help="both files have this name, ending in .exr and .png",
     )
     parser.add_argument(
         "--size", type=int, metavar="N", help="longer side in pixels (default: that of the fit, or 512)"
@@ -100,10 +116,43 @@ def output_stem(out: Path) -> Path:
     if out.suffix.lower() in _OTHER_ENDINGS:
         raise InputError(f"--out ends in {out.suffix}; give .png, .exr or no ending, both files are written")
     stem = out.with_suffix("") if out.suffix.lower() in _ENDINGS else out
-    if not stem.name:
-        raise InputError(f"--out {out} names no file")
+    if not stem.name or out.is_dir():
+        raise InputError(f"--out {out} names a folder; add the name of a picture")
     check_writable(stem.parent)
     return stem
+
+
+def picture_stems(stem: Path, options: argparse.Namespace) -> list[Path]:
+    """The paths of all pictures that the command writes, without their endings."""
+    if options.compare:
+        return [stem.with_name(f"{stem.name}_{name}") for name in _COMPARED]
+    if not options.turntable:
+        return [stem]
+    digits = count_digits(options.turntable)
+    return [stem.with_name(f"{stem.name}_{frame:0{digits}d}") for frame in range(options.turntable)]
+
+
+def count_digits(frames: int) -> int:
+    """Of the number of a turntable's frame in its file name."""
+    return max(3, len(str(frames - 1)))
+
+
+def check_pictures(stems: list[Path], options: argparse.Namespace) -> None:
+    """Raises InputError when a picture cannot be written, or would overwrite an input or a file that is not of this
+    program, such as the photo or an environment."""
+    from sira_mi.files import check_outputs, check_own
+
+    pictures = [stem.with_name(stem.name + ending) for stem in stems for ending in _ENDINGS]
+    check_outputs(pictures, (options.avatar, options.lights))
+    check_own(pictures)
+
+
+def video_command(stem: Path, frames: int) -> str:
+    """The ffmpeg command for a turntable's pictures, as a shell takes it. The video has even sides, as players need."""
+    place = str(stem.absolute())
+    command = ["ffmpeg", "-framerate", "24", "-i", f"{place.replace('%', '%%')}_%0{count_digits(frames)}d.png"]
+    command += ["-frames:v", str(frames), "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", f"{place}.mp4"]
+    return subprocess.list2cmdline(command) if sys.platform == "win32" else shlex.join(command)
 
 
 def _plan_pictures(
@@ -134,6 +183,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     _check(options)
     stem = output_stem(options.out)
+    stems = picture_stems(stem, options)
+    check_pictures(stems, options)
 
     from tqdm import tqdm
 
@@ -160,8 +211,8 @@ def main(arguments: list[str] | None = None) -> int:
         shape = load_head(subject, replace(settings, integrator="path"))
         with tqdm(total=settings.samples + CLOSED_FORM_SAMPLES, unit="spp", disable=None) as bar:
             result = compare(shape, subject.camera, light, options.yaw, settings, bar.update)
-        for name, image in (("sg", result.closed_form), ("path", result.traced)):
-            write_image(stem.with_name(f"{stem.name}_{name}"), image, options.exposure)
+        for picture, image in zip(stems, (result.closed_form, result.traced), strict=True):
+            write_image(picture, image, options.exposure)
         print(f"sg   {result.seconds[0]:7.1f} s  {CLOSED_FORM_SAMPLES} samples a pixel")
         print(f"path {result.seconds[1]:7.1f} s  {settings.samples} samples a pixel")
         print(
@@ -170,19 +221,14 @@ def main(arguments: list[str] | None = None) -> int:
         )
         return 0
 
-    frames = options.turntable or 1
-    digits = max(3, len(str(frames - 1)))
-    yaws = [options.yaw + 360 * frame / frames for frame in range(frames)]
+    yaws = [options.yaw + 360 * frame / len(stems) for frame in range(len(stems))]
     settings, shape = _plan_pictures(subject, light, settings, yaws, options)
-    with tqdm(total=frames * settings.samples, unit="spp", disable=None) as bar:
-        for frame, yaw in enumerate(yaws):
+    with tqdm(total=len(stems) * settings.samples, unit="spp", disable=None) as bar:
+        for frame, yaw in zip(stems, yaws, strict=True):
             scene = load_scene(shape, subject.camera, light, yaw, settings)
-            radiance = render_passes(scene, settings, bar.update)[..., :3]
-            name = f"{stem.name}_{frame:0{digits}d}" if options.turntable else stem.name
-            write_image(stem.with_name(name), radiance, options.exposure)
+            write_image(frame, render_passes(scene, settings, bar.update)[..., :3], options.exposure)
     if options.turntable:
-        pattern = stem.with_name(f"{stem.name}_%0{digits}d.png")
-        print(f'for a video: ffmpeg -framerate 24 -i "{pattern}" -pix_fmt yuv420p "{stem}.mp4"')
+        print(f"for a video: {video_command(stem, options.turntable)}")
     return 0
 
 
