@@ -55,13 +55,17 @@ def specular_brdf(
     specular_albedo: Float,
     roughness: Float,
 ) -> Float:
-    """f^s per steradian for unit vectors, 0 unless `view` and `light` are both above the surface."""
+    """f^s per steradian for unit vectors, 0 unless `view` and `light` are both above the surface.
+
+    v·h is computed as ½|v + l|, which is the same in both directions: v·h and l·h themselves differ by the rounding of
+    the vectors' lengths, and at grazing angles Fresnel by 3e-4."""
     cos_view, cos_light = dr.dot(normal, view), dr.dot(normal, light)
     above = (cos_view > 0.0) & (cos_light > 0.0)
-    half = dr.normalize(dr.select(above, view + light, normal))
+    both_directions = dr.select(above, view + light, normal)
+    half = dr.normalize(both_directions)
     density = distribution(0.5 * dr.squared_norm(half - normal), roughness)
     both = masking(dr.maximum(cos_view, 0.0), roughness) * masking(dr.maximum(cos_light, 0.0), roughness)
-    value = 0.25 * density * both * fresnel(specular_albedo, dr.dot(view, half))
+    value = 0.25 * density * both * fresnel(specular_albedo, 0.5 * dr.norm(both_directions))
     return dr.select(above, value, 0.0)
 
 
