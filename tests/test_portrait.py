@@ -172,6 +172,85 @@ def test_user_masks(tmp_path, astronaut):
         one_line(error, *words)
 
 
+@pytest.fixture
+def head_mask(face):
+    """An ellipse around the test portrait's face, bool [512, 512]."""
+    rows, columns = np.mgrid[:512, :512]
+    left, top, right, bottom = face.box
+    return ((columns - (left + right) / 2) / 80) ** 2 + ((rows - (top + bottom) / 2) / 110) ** 2 < 1
+
+
+def as_cutout(astronaut, mask):
+    return np.dstack([astronaut, mask * np.uint8(255)])
+
+
+def as_premultiplied(astronaut, mask):
+    return np.dstack([astronaut * mask[..., None], mask * np.uint8(255)])
+
+
+def as_grey_cutout(astronaut, mask):
+    grey = np.asarray(Image.fromarray(astronaut).convert("L"))
+    return np.dstack([grey * mask, mask * np.uint8(255)])
+
+
+def as_black_on_transparent(astronaut, mask):
+    return np.dstack([np.zeros_like(astronaut), mask * np.uint8(255)])
+
+
+def as_opaque(astronaut, mask):
+    white = np.repeat(mask[..., None] * np.uint8(255), 3, axis=2)
+    return np.dstack([white, np.full(mask.shape, 255, np.uint8)])
+
+
+@pytest.mark.parametrize(
+    "draw", [as_cutout, as_premultiplied, as_grey_cutout, as_black_on_transparent, as_opaque], ids=lambda f: f.__name__
+)
+def test_a_cutout_is_a_mask(tmp_path, photo_file, astronaut, head_mask, draw):
+    """However dark the person in it is: its alpha counts."""
+    picture = draw(astronaut, head_mask)
+    Image.fromarray(picture).save(tmp_path / "mask.png", compress_level=1)
+    np.testing.assert_array_equal(load_mask(tmp_path / "mask.png", load_photo(photo_file), 10**7), head_mask)
+
+
+def test_pictures_that_are_no_masks_are_refused(tmp_path, photo_file, astronaut, head_mask):
+    photo = load_photo(photo_file)
+    cases = {
+        "the photo": (astronaut, "picture in colour"),
+        "the person on black": (astronaut * head_mask[..., None], "picture in colour"),
+        "a red overlay": (np.where(head_mask[..., None], np.uint8([255, 0, 0]), astronaut), "picture in colour"),
+        "the photo in grey": (np.asarray(Image.fromarray(astronaut).convert("L")), "mostly grey"),
+        "labels": (head_mask.astype(np.uint8), "empty"),
+        "nothing": (np.zeros((512, 512), np.uint8), "empty"),
+        "transparent": (np.zeros((512, 512, 4), np.uint8), "empty"),
+    }
+    for name, (picture, words) in cases.items():
+        Image.fromarray(picture).save(tmp_path / "mask.png", compress_level=1)
+        with pytest.raises(InputError) as error:
+            load_mask(tmp_path / "mask.png", photo, 10**7)
+        one_line(error, "mask.png", words), name
+
+
+def test_a_mask_beside_the_face_is_refused(tmp_path, photo_file, head, face, head_mask):
+    """Inverted, or another person's, whether the face is found or known by the camera alone; one with a hand before
+    the face is taken, and one of the whole photo with a note."""
+    camera = estimate_camera(face.landmarks, head, 512, 512)
+    (tmp_path / "camera.json").write_text(camera.to_json())
+    Image.new("RGB", (512, 512)).save(tmp_path / "black.png")
+    half = head_mask & (np.mgrid[:512, :512][1] < face.landmarks[:, 0].mean())
+    cases = {"inverted": ~head_mask, "beside": np.roll(head_mask, 250, axis=1), "half": half, "all": head_mask | True}
+    for name, mask in cases.items():
+        Image.fromarray(mask).save(tmp_path / "mask.png")
+        for photo, given in ((photo_file, {}), (tmp_path / "black.png", {"camera_path": tmp_path / "camera.json"})):
+            if name in ("inverted", "beside"):
+                with pytest.raises(InputError) as error:
+                    make_portrait(photo, SETTINGS, head, tmp_path / "mask.png", **given)
+                one_line(error, "mask.png", "is it inverted?")
+            else:
+                portrait = make_portrait(photo, SETTINGS, head, tmp_path / "mask.png", **given)
+                np.testing.assert_array_equal(portrait.mask, mask)
+                assert any("covers the whole photo" in note for note in portrait.notes) == (name == "all")
+
+
 # The whole front end
 
 
@@ -252,7 +331,7 @@ def test_no_face_needs_both_mask_and_camera(tmp_path, head):
     coffee = skimage.data.coffee()[:300, :400]
     photo, mask_path, camera_path = (tmp_path / name for name in ("coffee.png", "mask.png", "camera.json"))
     Image.fromarray(coffee).save(photo)
-    Image.fromarray(np.pad(np.full((100, 100), 255, np.uint8), ((100, 100), (150, 150)))).save(mask_path)
+    Image.fromarray(np.pad(np.full((100, 100), 255, np.uint8), ((20, 180), (200, 100)))).save(mask_path)
     camera_path.write_text(a_camera(size=(400, 300)).to_json())
     for given in ({}, {"mask_path": mask_path}, {"camera_path": camera_path}):
         with pytest.raises(InputError) as error:

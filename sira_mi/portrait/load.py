@@ -82,18 +82,11 @@ def load_photo(path: str | Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
     return photo
 
 
-def load_grey(path: str | Path, max_pixels: int) -> tuple[np.ndarray, tuple[int, int], int]:
-    """Reads a mask image by its stored values (no transfer function; its alpha where the colour is constant).
+def load_stored(path: str | Path, max_pixels: int) -> Photo:
+    """Reads a mask image like a photo, by its stored values: no transfer function, no colour profile.
 
-    Returns the mask `[H, W]` float32 in [0, 1] after the file's own EXIF orientation and reduction, the full size
-    (width, height) after orientation, and the reduction. Raises `InputError` as `load_photo` does.
-    """
-    path = check_file(path, "mask")
-    photo = _load(path, max_pixels, _as_stored)
-    grey = photo.image.mean(axis=2)
-    if photo.alpha is not None and np.ptp(photo.alpha) > 0:
-        grey = photo.alpha if np.ptp(grey) == 0 else grey * photo.alpha
-    return np.clip(grey, 0, 1), photo.full_size, photo.reduction
+    Raises `InputError` as `load_photo` does."""
+    return _load(check_file(path, "mask"), max_pixels, _as_stored)
 
 
 def _as_stored(values: np.ndarray) -> np.ndarray:

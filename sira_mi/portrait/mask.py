@@ -13,7 +13,7 @@ import numpy as np
 
 from sira_mi.errors import InputError
 from sira_mi.portrait.face import Face, load_network, sample_square
-from sira_mi.portrait.load import Photo, load_grey, orient
+from sira_mi.portrait.load import Photo, load_stored, orient
 
 _SIDE = 256  # pixels; the network's input and output
 _WINDOWS = ((2.4, 0.0), (2.8, 0.1), (3.2, 0.25), (3.6, 0.4), (4.2, 0.6), (5.0, 0.95), (6.5, 1.5))  # side and centre
@@ -24,6 +24,8 @@ _BAND = 0.07  # in face sizes: how far GrabCut may move the outline
 _CUT_SIDE = 512  # pixels; longest side of the image that GrabCut works on
 _CUT_ITERATIONS = 2
 _EDGE_EPSILON = 4e-4  # variance of sRGB values in [0, 1] that counts as texture rather than edge
+_COLOURED, _FEW = 0.1, 0.01  # difference of channels, and share of such pixels, that make a picture one in colour
+_FACE_SHARE = 0.25  # of the face's landmarks that a given mask must contain
 _CONTRAST = (0.1, 0.9)  # filtered values below and above these become 0 and 1
 
 
@@ -105,10 +107,12 @@ def guided_filter(guide: np.ndarray, values: np.ndarray, radius: int, epsilon: f
 def load_mask(path: str | Path, photo: Photo, max_pixels: int) -> np.ndarray:
     """A user's mask for that photo, `[H, W]` like `photo.image`; above 0.5 is foreground, soft edges are kept.
 
-    Its size must be the photo's, either as stored in the file or as seen after EXIF orientation.
-    Raises `InputError` for another size, an empty mask, or a file that cannot be read.
+    It is white on black, or a cut-out, of which the alpha counts. Its size must be the photo's, either as stored in the
+    file or as seen after EXIF orientation. Raises `InputError` for another size, an empty mask, a picture that is no
+    mask, or a file that cannot be read.
     """
-    mask, size, reduction = load_grey(path, max_pixels)
+    stored = load_stored(path, max_pixels)
+    mask, size = _read_grey(path, stored), stored.full_size
     if size != photo.full_size:
         if size != photo.stored_size:
             raise InputError(
@@ -116,11 +120,38 @@ def load_mask(path: str | Path, photo: Photo, max_pixels: int) -> np.ndarray:
                 "give a mask of the photo's size"
             )
         mask = orient(mask, photo.orientation)
-    if reduction != photo.reduction or mask.shape != photo.image.shape[:2]:
+    if stored.reduction != photo.reduction or mask.shape != photo.image.shape[:2]:
         raise InputError(f"{path} does not cover the same pixels as the photo")
     if not (mask > 0.5).any():
         raise InputError(f"{path} is an empty mask: nothing in it is brighter than half (foreground is white)")
     return mask
+
+
+def _read_grey(path: str | Path, stored: Photo) -> np.ndarray:
+    """The alpha of a cut-out and of a picture of one colour, or else the brightness, times alpha, `[H, W]`."""
+    colours, alpha = np.clip(stored.image, 0, 1), stored.alpha
+    grey = colours.mean(axis=2)
+    if alpha is not None and (is_cutout(alpha) or np.ptp(grey) == 0 < np.ptp(alpha)):
+        return alpha
+    if (np.ptp(colours, axis=2) > _COLOURED).mean() > _FEW:
+        raise InputError(f"{path} is a picture in colour: a mask is white on the person and black elsewhere")
+    if ((grey > 0.1) & (grey < 0.9)).sum() > 0.5 * (grey > 0.1).sum() and (grey > 0.5).any():
+        raise InputError(f"{path} is mostly grey: a mask is white on the person and black elsewhere")
+    return grey if alpha is None else grey * alpha
+
+
+def check_mask(mask: np.ndarray, points: np.ndarray, mask_path: str | Path) -> None:
+    """Raises `InputError` when a given mask `[H, W]` has hardly any of the face's `points` `[L, 2]` (pixels) in it.
+    Points outside the image, and NaN, do not count."""
+    height, width = mask.shape
+    points = points[((points >= 0) & (points < (width, height))).all(axis=1)].astype(int)
+    if not len(points):
+        return
+    share = float((mask[points[:, 1], points[:, 0]] > 0.5).mean())
+    if share < _FACE_SHARE:
+        raise InputError(
+            f"{mask_path}: {share:.0%} of the face lies in the mask, which must be white on the person; is it inverted?"
+        )
 
 
 def is_cutout(alpha: np.ndarray) -> bool:

@@ -13,7 +13,7 @@ from sira_mi.portrait.camera import Camera, estimate_camera, measure_reprojectio
 from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.head_landmarks import correct_landmarks
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
-from sira_mi.portrait.mask import clean_mask, is_cutout, load_mask, segment_person
+from sira_mi.portrait.mask import check_mask, clean_mask, is_cutout, load_mask, segment_person
 
 _MIN_FACE_SHARE = 0.2  # of the working size; below it the photo is cropped to the head first
 _WINDOW = 4.5  # side of that crop, in face sizes
@@ -89,6 +89,11 @@ def make_portrait(
     if camera is None:
         assert found is not None and in_photo is not None  # select_face raises otherwise
         camera = _fit_camera(photo, in_photo, found.size, mean_landmarks, notes)
+    if given_mask is not None and mask_path is not None:
+        points = camera.project(mean_landmarks) if found is None else found.landmarks
+        check_mask(given_mask, points, mask_path)
+        if (given_mask > 0.5).all():
+            notes.append("the mask covers the whole photo: all of it counts as the person")
     window = _choose_window(photo, found, camera, settings.working_size, notes)
     image = np.maximum(window.resample(photo.image), 0)
     height, width = image.shape[:2]
