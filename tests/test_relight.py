@@ -4,6 +4,7 @@ writes its images."""
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -19,11 +20,13 @@ from sira_mi.errors import InputError
 from sira_mi.export.scene import head, sensor
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.sdf import deform
-from sira_mi.files import write_exr
+from sira_mi.files import read_exr, write_exr
+from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module
 from sira_mi.relight.__main__ import main
 from sira_mi.relight.compare import compare
+from sira_mi.relight.pictures import EXPOSURE_LEVEL, EXPOSURE_PERCENTILE, meter_exposure
 from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes
 from sira_mi.relight.subject import Light, Subject, read_light, read_subject
 from sira_mi.sg.fit_environment import render_environment
@@ -204,13 +207,57 @@ def test_the_command_writes_both_images(avatar_path, lights, tmp_path, voxel):
         radiance = file.channels()["RGB"].pixels
     png = np.asarray(Image.open(out))
     assert radiance.shape == png.shape == (24, 24, 3) and radiance.max() > 0.1 and (radiance[0, 0] == 0).all()
-    np.testing.assert_allclose(png / 255, linear_to_srgb(np.clip(radiance, 0, 1)), atol=0.6 / 255)
+    gain = EXPOSURE_LEVEL / np.percentile(radiance.max(axis=2)[radiance.max(axis=2) > 0], EXPOSURE_PERCENTILE)
+    np.testing.assert_allclose(png / 255, linear_to_srgb(np.clip(gain * radiance, 0, 1)), atol=0.04)
     assert {p.name for p in tmp_path.iterdir()} == {"lights.json", "Bild ä 1.png", "Bild ä 1.exr"}
 
 
 @pytest.mark.slow
+def test_the_exposure_is_metered_or_given_and_the_exr_has_none(avatar_path, tmp_path, voxel, capsys):
+    """Lights a thousand times apart give the same PNG, and their EXR files keep the factor."""
+    common = ["--integrator", "sg", "--spp", "1", "--size", "24", "--keep-all"]
+    for name, scale in (("dim", 0.03), ("bright", 30.0)):
+        write_lights(tmp_path / f"{name}.json", LOBES * ([1] * 4 + [scale] * 3))
+        assert main([avatar_path, *common, "--lights", f"{tmp_path / name}.json", "--out", str(tmp_path / name)]) == 0
+    dim, bright = (np.asarray(Image.open(tmp_path / f"{name}.png")).astype(int) for name in ("dim", "bright"))
+    assert np.abs(dim - bright).max() <= 1 and dim.max() > 200
+    dim, bright = (read_exr(tmp_path / f"{name}.exr")[0] for name in ("dim", "bright"))
+    np.testing.assert_allclose(1000 * dim, bright, rtol=1e-3, atol=1e-4)
+    lights = ["--lights", f"{tmp_path / 'bright'}.json"]
+    capsys.readouterr()
+    assert main([avatar_path, *common, *lights, "--exposure", "-5", "--out", str(tmp_path / "given")]) == 0
+    assert "--exposure -5.00" in capsys.readouterr().out
+    given = np.asarray(Image.open(tmp_path / "given.png"))
+    np.testing.assert_allclose(given / 255, linear_to_srgb(np.clip(bright / 32, 0, 1)), atol=0.6 / 255)
+
+
+def test_exposure_brings_a_percentile_to_its_level():
+    pixels = np.zeros((1000, 3))
+    pixels[:, 1] = np.linspace(0, 4, 1000)
+    assert np.isclose(2 ** meter_exposure(pixels), EXPOSURE_LEVEL / np.percentile(pixels[:, 1], EXPOSURE_PERCENTILE))
+    assert meter_exposure(np.zeros((5, 3))) == meter_exposure(np.zeros((0, 3))) == 0
+
+
+def test_the_head_is_framed_from_the_place_of_the_photos_camera(avatar, tmp_path):
+    """A head that is small in a corner of a wide photo fills the frame; seen from the same place."""
+    save_avatar(tmp_path / "avatar.safetensors", avatar)
+    wide = Camera(np.array([[50.0, 0, 90], [0, 50, 20], [0, 0, 1]]), VIEW.world_to_camera, 96, 64)
+    (tmp_path / "avatar.json").write_text(json.dumps({"camera": wide.to_dict()}))
+    photo = read_subject(tmp_path)
+    framed = photo.frame_head().camera
+    assert (framed.width, framed.height) == (96, 96)
+    np.testing.assert_array_equal(framed.world_to_camera, wide.world_to_camera)
+    np.testing.assert_allclose(framed.project(np.array([0, -0.2, 0])), [48, 48])
+    top = framed.project(np.array([[0, 2.0, 0], [0, -2.4, 0]]))
+    np.testing.assert_allclose(top[:, 1], [0, 96], atol=1e-6)
+    inside = replace(photo, camera=Camera(wide.K, np.eye(4), 96, 64))
+    with pytest.raises(InputError, match="--view photo"):
+        inside.frame_head()
+
+
+@pytest.mark.slow
 def test_a_turntable_is_a_full_turn(avatar_path, lights, tmp_path, voxel, capsys):
-    common = ["--lights", lights, "--integrator", "sg", "--spp", "1", "--size", "24"]
+    common = ["--lights", lights, "--integrator", "sg", "--spp", "1", "--size", "24", "--exposure", "0"]
     assert main([avatar_path, *common, "--turntable", "2", "--out", str(tmp_path / "turn.v2")]) == 0
     assert "ffmpeg" in capsys.readouterr().out
     assert main([avatar_path, *common, "--yaw", "180", "--out", str(tmp_path / "back.exr")]) == 0

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Renders a fitted head under another light, and writes IMAGE.exr (linear radiance) and IMAGE.png (sRGB).
 
-The head turns; the light and the camera stay fixed. Two integrators:
+The head turns; the light and the camera stay fixed. The PNG is exposed so that 98 % of the head's pixels are at most at
+0.8 of white, before sRGB, in their brightest channel; one exposure serves all frames of a turntable. --exposure sets it
+instead. Two integrators:
   path  path tracing: shadows and all interreflections, with noise that falls with --spp; uses an .exr as it is
   sg    closed form (eq. 8 of SIRA): quick and without noise, with approximate shadows and one bounce; fits spherical
         Gaussians to an .exr"""
@@ -31,7 +33,7 @@ examples:
   python -m sira_mi.relight avatar --lights scenes/lights/studio.exr --out relit.png
   python -m sira_mi.relight avatar --integrator sg --draft --turntable 48 --out turn
   python -m sira_mi.relight avatar --compare --out check"""
-_SAMPLES = {"path": 64, "sg": 8}
+_SAMPLES = {"path": 256, "sg": 8}
 _MAXIMUM_SIZE = 8192
 _MAXIMUM_SAMPLES = 1 << 20
 _MAXIMUM_FRAMES = 9999
@@ -59,8 +61,13 @@ def _parser() -> argparse.ArgumentParser:
         "--lights", type=Path, metavar="FILE", help=".exr environment or .json lobes (default: the light of the photo)"
     )
     parser.add_argument("--integrator", choices=("sg", "path"), default="path", help="(default: path)")
-    parser.add_argument("--spp", type=int, metavar="N", help="samples a pixel (default: 64, and 8 with sg)")
+    parser.add_argument("--spp", type=int, metavar="N", help="samples a pixel (default: 256, and 8 with sg)")
     parser.add_argument("--yaw", type=float, default=0.0, metavar="DEG", help="turns the head to its left (default: 0)")
+    parser.add_argument(
+        "--view",
+        choices=("head", "photo"),
+        help="head: a square around the head; photo: the frame of the photo (default: head, and photo with --compare)",
+    )
     parser.add_argument(
         "--out",
         type=image_path,
@@ -73,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the samples; the same seed repeats a picture")
     parser.add_argument("--turntable", type=int, metavar="N", help="N frames of a full turn, IMAGE_000, IMAGE_001, ...")
-    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the PNG (default: 0)")
+    parser.add_argument("--exposure", type=float, metavar="STOPS", help="of the PNG; 0 shows radiance 1 as white")
     parser.add_argument("--background", action="store_true", help="show the environment behind the head")
     parser.add_argument(
         "--exact", action="store_true", help="path: evaluate the albedo networks at every hit; slow (default: a vertex)"
@@ -188,8 +195,19 @@ def main(arguments: list[str] | None = None) -> int:
 
     from tqdm import tqdm
 
+    from sira_mi.export.scene import orbit
+    from sira_mi.files import read_exr, write_exr
     from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare
-    from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes, write_image
+    from sira_mi.relight.pictures import meter_exposure
+    from sira_mi.relight.render import (
+        RelightSettings,
+        head_pixels,
+        load_head,
+        load_scene,
+        render_passes,
+        with_ending,
+        write_preview,
+    )
     from sira_mi.relight.subject import read_light, read_subject
     from sira_mi.variants import set_variant
 
@@ -205,14 +223,18 @@ def main(arguments: list[str] | None = None) -> int:
         extra_channels=options.compare,
     )
     subject = read_subject(options.avatar, options.size)
+    if options.view == "head" or not (options.view or options.compare):
+        subject = subject.frame_head()
     light = read_light(options.lights, subject.avatar, lobes=options.compare or options.integrator == "sg")
 
     if options.compare:
         shape = load_head(subject, replace(settings, integrator="path"))
         with tqdm(total=settings.samples + CLOSED_FORM_SAMPLES, unit="spp", disable=None) as bar:
             result = compare(shape, subject.camera, light, options.yaw, settings, bar.update)
+        exposure = meter_exposure(result.traced[result.mask]) if options.exposure is None else options.exposure
         for picture, image in zip(stems, (result.closed_form, result.traced), strict=True):
-            write_image(picture, image, options.exposure)
+            write_exr(with_ending(picture, ".exr"), image)
+            write_preview(picture, image, exposure)
         print(f"sg   {result.seconds[0]:7.1f} s  {CLOSED_FORM_SAMPLES} samples a pixel")
         print(f"path {result.seconds[1]:7.1f} s  {settings.samples} samples a pixel")
         print(
@@ -223,10 +245,17 @@ def main(arguments: list[str] | None = None) -> int:
 
     yaws = [options.yaw + 360 * frame / len(stems) for frame in range(len(stems))]
     settings, shape = _plan_pictures(subject, light, settings, yaws, options)
+    exposures = []
     with tqdm(total=len(stems) * settings.samples, unit="spp", disable=None) as bar:
         for frame, yaw in zip(stems, yaws, strict=True):
             scene = load_scene(shape, subject.camera, light, yaw, settings)
-            write_image(frame, render_passes(scene, settings, bar.update)[..., :3], options.exposure)
+            radiance = render_passes(scene, settings, bar.update)[..., :3]
+            exposures.append(meter_exposure(head_pixels(radiance, shape, orbit(subject.camera, yaw))))
+            write_exr(with_ending(frame, ".exr"), radiance)
+    exposure = min(exposures) if options.exposure is None else options.exposure
+    for frame in stems:
+        write_preview(frame, read_exr(with_ending(frame, ".exr"))[0], exposure)
+    print(f"PNG: --exposure {exposure:.2f}")
     if options.turntable:
         print(f"for a video: {video_command(stem, options.turntable)}")
     return 0

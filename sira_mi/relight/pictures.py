@@ -6,6 +6,8 @@ from sira_mi.portrait.load import linear_to_srgb
 
 # The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
 _BRIGHTEST_SPECULAR = 0.08
+# Of the values of a head's brightest channel, this percentile is shown at this share of white.
+EXPOSURE_PERCENTILE, EXPOSURE_LEVEL = 98.0, 0.8
 _PEAK_NOISE = 1e-12  # least mean squared error that counts
 
 
@@ -25,6 +27,13 @@ def preview(name: str, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         near, far = image[covered].min(), image[covered].max()
         return np.where(covered, 1 - 0.85 * (image - near) / max(far - near, 1e-6), 0)
     return linear_to_srgb(image)
+
+
+def meter_exposure(pixels: np.ndarray) -> float:
+    """The exposure, in stops, that brings `EXPOSURE_PERCENTILE` of the brightest channel of a head's pixels [N, 3],
+    linear radiance, to `EXPOSURE_LEVEL`; 0 for a head without light."""
+    level = float(np.percentile(pixels.max(axis=1), EXPOSURE_PERCENTILE)) if len(pixels) else 0.0
+    return float(np.log2(EXPOSURE_LEVEL / level)) if level > 0 else 0.0
 
 
 def psnr(values: np.ndarray, truth: np.ndarray) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from sira_mi.errors import InputError
 from sira_mi.export.scene import head, head_scene, orbit, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
-from sira_mi.files import write_exr, write_png
+from sira_mi.files import write_png
 from sira_mi.portrait.camera import Camera, yaw_rotation
 from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.subject import Light, Subject
@@ -135,7 +135,19 @@ def render_passes(
     return picture
 
 
-def write_image(stem: Path, radiance: np.ndarray, exposure: float = 0.0) -> None:
-    """`stem`.exr with linear radiance [H, W, 3], and `stem`.png in sRGB, 2**exposure times as bright."""
-    write_exr(stem.with_name(stem.name + ".exr"), radiance)
-    write_png(stem.with_name(stem.name + ".png"), linear_to_srgb(np.clip(radiance * 2.0**exposure, 0, 1)))
+def head_pixels(picture: np.ndarray, shape: NeuralSDF, camera: Camera) -> np.ndarray:
+    """The pixels [N, channels] of a picture [H, W, channels] that vertices of the head are projected to."""
+    position = np.floor(camera.project(shape.vertices().T))
+    inside = ((position >= 0) & (position < (camera.width, camera.height))).all(axis=1)
+    column, row = np.unique(position[inside].astype(int), axis=0).T
+    return picture[row, column]
+
+
+def with_ending(stem: Path, ending: str) -> Path:
+    """The path of an image file whose name without its ending is that of `stem`."""
+    return stem.with_name(stem.name + ending)
+
+
+def write_preview(stem: Path, radiance: np.ndarray, exposure: float) -> None:
+    """`stem`.png in sRGB of linear radiance [H, W, 3], 2**exposure times as bright."""
+    write_png(with_ending(stem, ".png"), linear_to_srgb(np.clip(radiance * 2.0**exposure, 0, 1)))

@@ -23,6 +23,8 @@ PORTRAIT_CAMERA = Camera(
     width=512,
     height=512,
 )
+# The frame of a picture of the head: a square around this point of the world, which reaches the top of the domain.
+_HEAD_CENTRE, _HEAD_HALF_SIDE = np.array([0.0, -0.2, 0.0]), 2.2
 _MAXIMUM_REPORT_BYTES = 16 << 20
 
 
@@ -42,6 +44,21 @@ class Subject:
             self,
             camera=self.camera.scale(width / self.camera.width, height / self.camera.height, width, height),
         )
+
+    def frame_head(self) -> Subject:
+        """The same with a square frame around the head, as large as the longer side of the photo's; the camera keeps
+        its place and direction.
+
+        Raises InputError when the camera is too close to the head for that."""
+        camera = self.camera
+        size = max(camera.width, camera.height)
+        depth = float(camera.world_to_camera[2, :3] @ _HEAD_CENTRE + camera.world_to_camera[2, 3])
+        if depth <= _HEAD_HALF_SIDE:
+            raise InputError(f"{self.path}: the camera of its photo is not before the head; give --view photo")
+        side = 2 * _HEAD_HALF_SIDE * camera.K[0, 0] / depth
+        x, y = camera.project(_HEAD_CENTRE) - side / 2
+        window = camera.crop(x, y, size, size)
+        return replace(self, camera=window.scale(size / side, size / side, size, size))
 
 
 @dataclass(frozen=True, eq=False)
