@@ -1,4 +1,4 @@
-"""RGB colour spaces by the chromaticities of their primaries and white point."""
+"""The sRGB transfer function, and RGB colour spaces by the chromaticities of their primaries and white point."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,18 @@ REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # x and y of red
 D50 = np.array([0.9642, 1.0, 0.8249])  # XYZ of the white that ICC profiles refer to
 
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+
+def srgb_to_linear(values: np.ndarray) -> np.ndarray:
+    """sRGB-coded values `[...]` in [0, 1] to linear ones (IEC 61966-2-1)."""
+    values = np.asarray(values, np.float32)
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(values: np.ndarray) -> np.ndarray:
+    """Linear values `[...]`, clipped to [0, 1], to sRGB-coded ones (IEC 61966-2-1)."""
+    values = np.clip(np.asarray(values, np.float32), 0, 1)
+    return np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
 
 
 def convert_to_rec709(chromaticities: Sequence[float]) -> np.ndarray | None:

@@ -1,6 +1,7 @@
 """Checks and reads a user's files; writes files whole or not at all; the image formats of the project."""
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -196,6 +197,27 @@ def parse_json(text: str | bytes, source: str) -> Any:
         raise InputError(f"{source} is not JSON: {error}") from None
 
 
+_READING_EXR = threading.Lock()
+
+
+@contextlib.contextmanager
+def _silence_openexr() -> Iterator[None]:
+    """OpenEXR writes its complaints to file descriptor 2 from C, and to Python's standard output; both belong to the
+    whole process, so that only one thread at a time reads an OpenEXR file."""
+    with _READING_EXR, contextlib.ExitStack() as stack:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        stack.callback(os.close, nowhere)
+        try:
+            terminal = os.dup(2)
+        except OSError:  # the program runs without a standard error
+            terminal = os.dup(nowhere)
+        stack.callback(os.close, terminal)
+        stack.callback(os.dup2, terminal, 2)
+        os.dup2(nowhere, 2)
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+        yield
+
+
 def read_exr(
     path: str | Path, check_size: Callable[[int, int], None] | None = None, max_pixels: int = MAX_EXR_PIXELS
 ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -206,8 +228,9 @@ def read_exr(
     decoded. Raises InputError for any other file, more than `max_pixels` in all parts together, subsampled channels,
     pixels that are not square, and colours that are not finite."""
     try:
-        headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
-        names = [{channel.name for channel in header["channels"]} for header in headers]
+        with _silence_openexr():
+            headers = [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+            names = [{channel.name for channel in header["channels"]} for header in headers]
     except Exception:  # OpenEXR raises bare RuntimeError and others
         raise InputError(f"{path}: not a readable OpenEXR image; export it again") from None
     part, colours = _choose_part(path, names)
@@ -216,7 +239,7 @@ def read_exr(
     if check_size is not None:
         check_size(*size)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silence_openexr(), OpenEXR.File(str(path), separate_channels=True) as file:
             planes = {name: channel.pixels for name, channel in file.channels(part).items() if name in (*colours, "A")}
     except Exception:
         raise InputError(f"{path}: not a readable OpenEXR image; export it again") from None

@@ -8,11 +8,12 @@ import skimage.data
 from conftest import a_camera, one_line
 from PIL import Image
 
+from sira_mi.colour import linear_to_srgb, srgb_to_linear
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import estimate_camera, measure_reprojection_error
 from sira_mi.portrait.face import find_faces, select_face
-from sira_mi.portrait.load import linear_to_srgb, load_photo, srgb_to_linear
+from sira_mi.portrait.load import load_photo
 from sira_mi.portrait.mask import guided_filter, load_mask, segment_person
 from sira_mi.portrait.portrait import Portrait, PortraitSettings, area_resample, halve, make_portrait
 

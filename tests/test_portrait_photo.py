@@ -12,8 +12,9 @@ import tifffile
 from conftest import one_line
 from PIL import Image, ImageCms, ImageOps
 
+from sira_mi.colour import linear_to_srgb, srgb_to_linear
 from sira_mi.errors import InputError
-from sira_mi.portrait.load import linear_to_srgb, load_photo, srgb_to_linear
+from sira_mi.portrait.load import load_photo
 from sira_mi.portrait.portrait import PortraitSettings
 
 SETTINGS = PortraitSettings(working_size=512)

@@ -16,13 +16,13 @@ from conftest import camera, small_avatar
 from PIL import Image
 
 from sira_mi.avatar.file import save_avatar
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
 from sira_mi.export.scene import head, sensor
 from sira_mi.fields.columns import evaluate_in_chunks
 from sira_mi.fields.sdf import deform
 from sira_mi.files import read_exr, write_exr
 from sira_mi.portrait.camera import Camera
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight import render as render_module
 from sira_mi.relight.__main__ import main
 from sira_mi.relight.compare import compare

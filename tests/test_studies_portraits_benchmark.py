@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.portrait.camera import convert_exif_focal
-from sira_mi.portrait.load import linear_to_srgb, load_photo
+from sira_mi.portrait.load import load_photo
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.lighting import map_directions, render_lobes
 from sira_mi.training.collection.render import Part, RenderSettings, build_scene, project, render_views

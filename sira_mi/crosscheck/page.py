@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
 from sira_mi.files import write_png, write_text
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.compare import CLOSED_FORM_SAMPLES, compare, mean_radiance
 from sira_mi.relight.pictures import psnr_inside
 from sira_mi.relight.render import RelightSettings, load_head, load_scene, render_passes

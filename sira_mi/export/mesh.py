@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.fields.columns import evaluate_in_chunks, unit_columns
 from sira_mi.fields.sdf import surface
 from sira_mi.files import write_through
-from sira_mi.portrait.load import linear_to_srgb
 
 
 def write_mesh(path: Path, shape) -> None:

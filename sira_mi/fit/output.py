@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.export.scene import head, head_scene, orbit, sensor, sg_light
 from sira_mi.files import write_exr, write_png, write_text
 from sira_mi.portrait.camera import Camera
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import preview
 from sira_mi.sg.layers import split_layers

@@ -1,20 +1,25 @@
-"""Photo files to linear Rec.709 images: colour, orientation, alpha, size limits and EXIF data of the lens."""
+"""Photo files to linear Rec.709 images: size limits, reduction, orientation, alpha."""
 
-import contextlib
-import io
-import os
-import threading
-import warnings
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image, ImageCms
 
 from sira_mi.errors import InputError
 from sira_mi.files import check_file, read_exr
+from sira_mi.portrait.encoding import Encoding, read_encoding
+from sira_mi.portrait.formats import (
+    TIFF_HEIGHT,
+    TIFF_WIDTH,
+    Strips,
+    check_mode,
+    is_deep,
+    open_picture,
+    read_exif,
+    read_strips,
+)
 
 MIN_SIDE = 32  # pixels; anything smaller holds no face that could be fitted
 MAX_FILE_PIXELS = 400_000_000
@@ -22,12 +27,9 @@ MAX_EXR_PIXELS = 100_000_000  # of all parts: 1.6 GB of R, G, B and alpha
 DEFAULT_MAX_PIXELS = 26_000_000
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
-_ORIENTATION, _EXIF_IFD, _FOCAL_35MM, _TIFF_WIDTH, _TIFF_HEIGHT = 0x0112, 0x8769, 0xA405, 256, 257
 _FLIPS_X, _FLIPS_Y = (2, 3, 7, 8), (3, 4, 6, 7)  # orientations that reverse the stored x or y axis
-_DECODING = threading.Lock()
 _STRIP_PIXELS = 4_000_000
 _LEAST_ALPHA = 1 / 255  # premultiplied colours of less say nothing
-_GREYS = ("1", "L", "LA", "La", "I;16", "I;16B", "I;16L", "I;16N")
 
 
 @dataclass(frozen=True)
@@ -45,18 +47,6 @@ class Photo:
     notes: tuple[str, ...]
 
 
-def srgb_to_linear(values: np.ndarray) -> np.ndarray:
-    """sRGB-coded values `[...]` in [0, 1] to linear ones (IEC 61966-2-1)."""
-    values = np.asarray(values, np.float32)
-    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(values: np.ndarray) -> np.ndarray:
-    """Linear values `[...]`, clipped to [0, 1], to sRGB-coded ones (IEC 61966-2-1)."""
-    values = np.clip(np.asarray(values, np.float32), 0, 1)
-    return np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055)
-
-
 def orient(image: np.ndarray, orientation: int) -> np.ndarray:
     """Applies an EXIF orientation (1 to 8) to an image as stored, `[H, W, ...]`."""
     if orientation >= 5:
@@ -68,13 +58,16 @@ def orient(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def load_photo(path: str | Path, max_pixels: int = DEFAULT_MAX_PIXELS) -> Photo:
-    """Reads a photo: a format that Pillow reads (JPEG, PNG, TIFF, ...) with 8 or 16 bits, or a linear EXR.
+    """Reads a photo: JPEG, PNG, TIFF, WebP, HEIC, AVIF, JPEG 2000, BMP, GIF or PPM with 8 or 16 bits, or an EXR.
+
+    The colours that the file declares (ICC profile, gAMA and cHRM, CICP, chromaticities) are converted to Rec.709;
+    without a declaration they are sRGB, and linear Rec.709 in an EXR. What a file says and is not obeyed is in `notes`.
 
     A photo of more than `max_pixels` is reduced by a power of two, averaging in linear light.
     Raises `InputError` for any other file.
     """
     path = check_file(path, "photo")
-    photo = _load(path, max_pixels, srgb_to_linear)
+    photo = _load(path, max_pixels)
     height, width = photo.image.shape[:2]
     if photo.reduction > 1:
         note = f"{path.name} is {photo.full_size[0]}x{photo.full_size[1]}: downscaled on load to {width}x{height}"
@@ -86,22 +79,22 @@ def load_stored(path: str | Path, max_pixels: int) -> Photo:
     """Reads a mask image like a photo, by its stored values: no transfer function, no colour profile.
 
     Raises `InputError` as `load_photo` does."""
-    return _load(check_file(path, "mask"), max_pixels, _as_stored)
+    return _load(check_file(path, "mask"), max_pixels, Encoding(_as_stored))
 
 
 def _as_stored(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _load(path: Path, max_pixels: int, decode: Callable) -> Photo:
-    with _DECODING, _quiet_decoders():
-        is_exr = _head(path) == _EXR_MAGIC
-        return _load_exr(path, max_pixels) if is_exr else _load_coded(path, max_pixels, decode)
-
-
-def _head(path: Path) -> bytes:
+def _load(path: Path, max_pixels: int, encoding: Encoding | None = None) -> Photo:
+    """A photo by the given encoding, or by the one that its file declares."""
     with path.open("rb") as file:
-        return file.read(4)
+        head = file.read(16)
+    if head[:4] == _EXR_MAGIC:
+        return _load_exr(path, max_pixels)
+    notes: list[str] = []
+    with open_picture(path, head, notes) as picture:
+        return _decode(path, picture, max_pixels, encoding, notes)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
@@ -120,66 +113,27 @@ def _reduction(width: int, height: int, max_pixels: int) -> int:
     return factor
 
 
-@contextlib.contextmanager
-def _quiet_decoders() -> Iterator[None]:
-    """Silences the decoders: Python's warnings, the prints of OpenEXR, and what libtiff and OpenEXR write from C to
-    file descriptor 2. Also lifts Pillow's size limit, which `_check_size` replaces. All this is the process's: one
-    thread at a time."""
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        terminal = os.dup(2)
-    except OSError:  # the program runs without a standard error
-        terminal = os.dup(nowhere)
-    os.dup2(nowhere, 2)
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        os.dup2(terminal, 2)
-        os.close(terminal)
-        os.close(nowhere)
-        Image.MAX_IMAGE_PIXELS = limit
-
-
-def _load_coded(path: Path, max_pixels: int, decode: Callable) -> Photo:
-    try:
-        picture = Image.open(path)
-    except Exception:  # Pillow's format readers have no common error for files that are not theirs
-        raise InputError(f"{path} is not an image that can be read: save it as PNG, JPEG or TIFF") from None
-    with picture:
-        return _decode(path, picture, max_pixels, decode)
-
-
-def _decode(path: Path, picture: Image.Image, max_pixels: int, decode: Callable) -> Photo:
-    notes: list[str] = []
+def _decode(path: Path, picture: Any, max_pixels: int, encoding: Encoding | None, notes: list[str]) -> Photo:
+    deep = is_deep(picture)
     tags = getattr(picture, "tag_v2", {})
-    stored = (int(tags.get(_TIFF_WIDTH, picture.size[0])), int(tags.get(_TIFF_HEIGHT, picture.size[1])))
+    stored = (int(tags.get(TIFF_WIDTH, picture.size[0])), int(tags.get(TIFF_HEIGHT, picture.size[1])))
     _check_size(path, *stored)
-    orientation, focal = _exif(picture, notes)
-    is_deep = ";16" in str(getattr(picture, "tile", "")) and picture.format in ("PNG", "TIFF")
+    exif = read_exif(path, picture, stored, notes)
     try:
         picture.load()
     except Exception as error:  # every decoder has its own way to fail on a damaged file
         raise InputError(f"{path} is damaged or truncated ({_one_line(error)}): export it again") from None
-    if picture.mode in ("I", "F"):
-        raise InputError(f"{path} has 32-bit pixels: save it as 8- or 16-bit PNG, or as EXR")
-    pending, _ = _exif(picture, [])  # 1 where the decoder has oriented the pixels, as for TIFF
-    colour = None if decode is not srgb_to_linear else _colour_transform(picture, notes)
-    if is_deep and colour is None:
-        strip = _deep_strips(path, picture)
-    else:
-        strip = _pillow_strips(picture, colour)
-        if is_deep:
-            notes.append(f"{path.name} has 16 bits and a colour profile: converted to sRGB at 8 bits")
-    image, alpha, factor = _reduce(picture.size, pending, max_pixels, strip, decode)
-    full = stored[::-1] if orientation >= 5 else stored
-    return Photo(image, alpha, focal, orientation, stored, full, factor, tuple(notes))
+    check_mode(path, picture, deep)
+    encoding = encoding or read_encoding(path, picture, deep, notes)
+    size, is_oriented, strip = read_strips(path, picture, encoding, deep)
+    pending = 1 if is_oriented else exif.orientation
+    image, alpha, factor = _reduce(size, pending, max_pixels, strip, encoding)
+    full = stored[::-1] if exif.orientation >= 5 else stored
+    return Photo(image, alpha, exif.focal_35mm, exif.orientation, stored, full, factor, tuple(notes))
 
 
 def _reduce(
-    size: tuple[int, int], orientation: int, max_pixels: int, strip: Callable, decode: Callable
+    size: tuple[int, int], orientation: int, max_pixels: int, strip: Strips, encoding: Encoding
 ) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Decodes strip by strip, averages blocks and orients. Rows and columns that fill no block are cut right and
     below."""
@@ -196,12 +150,23 @@ def _reduce(
         rgb, opacity = strip(left, top + y * factor, left + width * factor, top + stop * factor)
         largest = np.iinfo(rgb.dtype).max
         if table is None:
-            table = decode(np.arange(largest + 1, dtype=np.float32) / largest).astype(np.float32)
-        image[y:stop] = _block_mean(table[rgb], factor)
+            table = encoding.curve(np.arange(largest + 1, dtype=np.float32) / largest).astype(np.float32)
+        image[y:stop] = _block_mean(_look_up(table, rgb), factor)
         if opacity is not None:
             alpha = np.empty((height, width), np.float32) if alpha is None else alpha
             alpha[y:stop] = _block_mean(opacity.astype(np.float32)[..., None] / largest, factor)[..., 0]
+    if encoding.matrix is not None:
+        image = np.maximum(image @ encoding.matrix.T.astype(np.float32), 0)
     return orient(image, orientation), None if alpha is None else orient(alpha, orientation), factor
+
+
+def _look_up(table: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Values `[h, w, 3]` of `table`, `[N]` or `[N, 3]`, at `levels` `[h, w, 1 or 3]`."""
+    if table.ndim == 1:
+        values = table[levels]
+    else:
+        values = np.take_along_axis(table, levels.reshape(-1, levels.shape[2]), 0).reshape(*levels.shape[:2], 3)
+    return values if values.shape[2] == 3 else np.repeat(values, 3, axis=2)
 
 
 def _block_mean(pixels: np.ndarray, factor: int) -> np.ndarray:
@@ -211,82 +176,6 @@ def _block_mean(pixels: np.ndarray, factor: int) -> np.ndarray:
     height, width, channels = pixels.shape
     means = cv2.resize(pixels, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     return means.reshape(height // factor, width // factor, channels)
-
-
-def _pillow_strips(picture: Image.Image, colour: Callable | None) -> Callable:
-    has_alpha = picture.mode in ("LA", "PA", "La", "RGBA", "RGBa") or "transparency" in picture.info
-    depth_16 = picture.mode.startswith("I;16")
-
-    def strip(left: int, top: int, right: int, bottom: int) -> tuple[np.ndarray, np.ndarray | None]:
-        part = picture.crop((left, top, right, bottom))
-        if depth_16 and colour is None:
-            return np.repeat(np.asarray(part, np.uint16)[..., None], 3, axis=2), None
-        if depth_16:
-            part = Image.fromarray((np.asarray(part, np.uint16) >> 8).astype(np.uint8))
-        alpha = np.asarray(part.convert("RGBA"))[..., 3] if has_alpha else None
-        part = colour(part) if colour is not None else part.convert("RGB")
-        return np.asarray(part), alpha
-
-    return strip
-
-
-def _deep_strips(path: Path, picture: Image.Image) -> Callable:
-    """Strips of a PNG or TIFF with 16 bits; Pillow keeps only 8 of them when there are several channels."""
-    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.shape[1::-1] != picture.size:
-        return _pillow_strips(picture, None)
-    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    order = {1: [0, 0, 0], 2: [0, 0, 0], 3: [2, 1, 0], 4: [2, 1, 0]}[pixels.shape[2]]
-
-    def strip(left: int, top: int, right: int, bottom: int) -> tuple[np.ndarray, np.ndarray | None]:
-        part = pixels[top:bottom, left:right]
-        return part[..., order], part[..., -1] if pixels.shape[2] in (2, 4) else None
-
-    return strip
-
-
-def _colour_transform(picture: Image.Image, notes: list[str]) -> Callable | None:
-    """The conversion to sRGB that the embedded ICC profile asks for, or None when plain conversion is right."""
-    icc = picture.info.get("icc_profile")
-    if not icc:
-        if picture.mode == "CMYK":
-            notes.append("CMYK without a colour profile: colours converted by the plain formula")
-        return None
-    try:
-        profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
-        space = profile.profile.xcolor_space.strip()
-        source_mode = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}[space]
-        if (source_mode == "CMYK") != (picture.mode == "CMYK") or (source_mode == "L" and picture.mode not in _GREYS):
-            raise ValueError(f"a profile for {space} with pixels of mode {picture.mode}")
-        if source_mode == "RGB" and "srgb" in ImageCms.getProfileDescription(profile).lower():
-            return None
-        transform = ImageCms.buildTransform(
-            profile,
-            ImageCms.createProfile("sRGB"),
-            source_mode,
-            "RGB",
-            renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
-            flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
-        )
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError, KeyError):
-        notes.append("the embedded colour profile is broken or does not fit: read as sRGB")
-        return None
-    return lambda part: ImageCms.applyTransform(part.convert(source_mode), transform)
-
-
-def _exif(picture: Image.Image, notes: list[str]) -> tuple[int, float | None]:
-    """Orientation (1 to 8) and 35 mm focal length (mm, or None); damaged EXIF counts as none, with a note."""
-    try:
-        exif = picture.getexif()
-        orientation = exif.get(_ORIENTATION, 1)
-        focal = exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM)
-        focal = float(focal) if focal else None
-    except Exception:  # Pillow's EXIF parser fails in as many ways as there are damaged files
-        notes.append("damaged EXIF data: ignored")
-        return 1, None
-    if orientation not in range(1, 9):
-        orientation = 1
-    return int(orientation), focal if focal is not None and 5 <= focal <= 2000 else None
 
 
 def _load_exr(path: Path, max_pixels: int) -> Photo:

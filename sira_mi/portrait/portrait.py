@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import LANDMARKS, LUMINANCE, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.files import read_json
 from sira_mi.portrait.camera import Camera, estimate_camera, measure_reprojection_error
 from sira_mi.portrait.face import Face, find_faces, select_face
 from sira_mi.portrait.head_landmarks import correct_landmarks
-from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, linear_to_srgb, load_photo
+from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, Photo, load_photo
 from sira_mi.portrait.mask import check_mask, clean_mask, is_cutout, load_mask, segment_person
 
 _MIN_FACE_SHARE = 0.2  # of the working size; below it the photo is cropped to the head first

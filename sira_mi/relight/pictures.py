@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.colour import linear_to_srgb
 
 # The specular albedo that previews show as white: reflectance at normal incidence of a material of index 1.8.
 _BRIGHTEST_SPECULAR = 0.08

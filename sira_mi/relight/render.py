@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, cast
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
 from sira_mi.export.scene import head, head_scene, orbit, sensor
 from sira_mi.fields.extraction import EmptySurfaceError
 from sira_mi.files import write_png
 from sira_mi.portrait.camera import Camera, yaw_rotation
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.subject import Light, Subject
 
 if TYPE_CHECKING:

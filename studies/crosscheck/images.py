@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
-from sira_mi.portrait.load import linear_to_srgb
 
 # Rays of one launch.
 _LAUNCH = 1 << 21

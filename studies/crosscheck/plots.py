@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
-from sira_mi.portrait.load import linear_to_srgb
 from studies.crosscheck import curves
 from studies.crosscheck.evidence import Lit
 from studies.crosscheck.fits import FitPoint

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from sira_mi.portrait.load import linear_to_srgb
+from sira_mi.colour import linear_to_srgb
 from sira_mi.relight.pictures import psnr
 from sira_mi.training.collection.skin import SKIN
 from studies.measures import F0_OF_STRENGTH, correlation, luminance, scale_channels, ssim_inside

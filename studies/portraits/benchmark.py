@@ -19,11 +19,11 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.files import write_through
 from sira_mi.portrait.landmarks import CHIN
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.build import VARIANT
 from sira_mi.training.collection.render import find_exposure
 from sira_mi.training.collection.skin import CLOTH

@@ -22,6 +22,7 @@ import numpy as np
 from sira_mi.avatar.decoders import diffuse_albedo, illumination, specular_albedo
 from sira_mi.avatar.file import Avatar, save_avatar
 from sira_mi.avatar.shape import HeadShape, head_of
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import HELD_OUT_VIEWS, MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import evaluate_in_chunks, from_columns, to_columns, unit_columns
@@ -29,7 +30,6 @@ from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import surface
 from sira_mi.optimisation.adam import adam, cosine_fall, parameter_values, take_step
 from sira_mi.portrait.landmarks import NOSE_TIP
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.relight.pictures import psnr
 from sira_mi.sg.radiance import Material, closed_form_radiance, reflect
 from sira_mi.sg.shading import shade

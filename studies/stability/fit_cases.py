@@ -9,11 +9,11 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.files import write_png, write_text, write_through
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.stage import FitSettings
 from sira_mi.portrait.camera import Camera
-from sira_mi.portrait.load import linear_to_srgb
 from studies.portraits.benchmark import EXIF_IFD, FOCAL_TAG, JPEG_QUALITY
 from studies.portraits.truth import Truth
 from studies.stability.fit_truth import FOCAL_35MM

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 from skimage.measure import points_in_poly
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import DOMAIN_LOWER, DOMAIN_UPPER, LUMINANCE
 from sira_mi.portrait.landmarks import CHEEKS, CHIN, LIP_BORDER, NOSE_UNDERSIDE, OVAL
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.annotation import mean_head
 from sira_mi.training.collection.render import Part

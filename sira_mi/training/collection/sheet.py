@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
-from sira_mi.portrait.load import linear_to_srgb
 from sira_mi.training.collection.build import load_scene
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sira_mi.portrait.load import srgb_to_linear
+from sira_mi.colour import srgb_to_linear
 from sira_mi.training.collection.surface import BODY_FLOOR
 from sira_mi.training.collection.triangles import connected_pieces, undirected_edges, vertex_normals
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from sira_mi.colour import srgb_to_linear
 from sira_mi.errors import InputError
 from sira_mi.portrait.landmarks import CHIN
-from sira_mi.portrait.load import srgb_to_linear
 from sira_mi.training.collection.annotation import find_face, find_frame, list_axis_turns
 from sira_mi.training.collection.regions import (
     choose_edge_lengths,
