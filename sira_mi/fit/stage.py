@@ -116,8 +116,8 @@ class FitTask:
         return find_photo_points(portrait, head)
 
     def pose_portrait(self, state: FitState) -> Portrait:
-        """The portrait, its camera moved so that it sees the head unmoved."""
-        return pose_portrait(self.portrait, state)
+        """The portrait, its camera moved so that it sees the unmoved head as it saw the head in the pose of `state`."""
+        return replace(self.portrait, camera=move_camera(self.portrait.camera, state.pose))
 
     def write_avatar(self, state: FitState) -> Path:
         """Writes the avatar at `state` for the plugins to read; its path."""
@@ -126,17 +126,12 @@ class FitTask:
         return path
 
     def share(self, kind: type[Shared], make: Callable[[], Shared]) -> Shared:
-        """What stages of a kind have in common and is slow to make: the result of `make`, of class `kind`, again for as
-        long as no stage asks for another class."""
+        """What consecutive stages have in common and is slow to make: the result of `make`, of class `kind`. It is
+        made once, and again after a stage that shares another class."""
         if type(self._shared) is not kind:
             self._shared = None  # frees its memory before the next is made
             self._shared = make()
         return self._shared
-
-
-def pose_portrait(portrait: Portrait, state: FitState) -> Portrait:
-    """The portrait, its camera moved so that it sees the head unmoved as it saw it in the pose of `state`."""
-    return replace(portrait, camera=move_camera(portrait.camera, state.pose))
 
 
 def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
