@@ -13,10 +13,7 @@ from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.export import scene as scenes
 from sira_mi.fields.columns import to_array
-from sira_mi.plugins.neural_albedo import NeuralAlbedo
-from sira_mi.plugins.neural_sdf import NeuralSDF
-from sira_mi.plugins.sg_envmap import SGEnvmap
-from sira_mi.plugins.sira_bsdf import SiraBSDF
+from sira_mi.plugins import neural_albedo, neural_sdf, sg_envmap, sira_bsdf  # reloaded with the variant
 from sira_mi.relight.subject import PORTRAIT_CAMERA, read_subject
 
 
@@ -35,13 +32,13 @@ class Case:
     others: tuple = ()  # further shapes of the scene
     lobes: np.ndarray | None = None  # [N_l, 7] of the scene's own light, in world coordinates
 
-    def head(self, voxel: float, baked: bool = True) -> NeuralSDF:
+    def head(self, voxel: float, baked: bool = True) -> neural_sdf.NeuralSDF:
         """The head as a shape whose mesh has the spacing `voxel`, scene units. Albedos are `baked` at the vertices, or
         evaluated by the networks at every hit."""
         description = scenes.head(self.avatar, voxel, baked, to_world=mi.ScalarTransform4f(self.to_world))
         bsdf = description["bsdf"]
         bsdf["roughness"], bsdf["k_s"] = self.roughness, self.k_s
-        return cast(NeuralSDF, mi.load_dict(description))
+        return cast(neural_sdf.NeuralSDF, mi.load_dict(description))
 
     def scene(self, head: mi.Shape, lobes: np.ndarray, light: dict | None = None, even: bool = False) -> mi.Scene:
         """The head under `lobes` [N_l, 7], or under the emitter that `light` describes. The sampler is independent, or
@@ -76,15 +73,17 @@ def _case_of_scene(path: Path, size: int) -> Case:
         scene = mi.load_file(str(path), optimize=False)
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{path}: Mitsuba cannot load it: {str(error).splitlines()[-1].strip()}") from error
-    heads = [shape for shape in scene.shapes() if isinstance(shape, NeuralSDF)]
+    heads = [shape for shape in scene.shapes() if isinstance(shape, neural_sdf.NeuralSDF)]
     if len(heads) != 1:
         raise InputError(f"{path} holds {len(heads)} neural_sdf; a cross-check needs exactly one")
     head, bsdf, light = heads[0], heads[0].bsdf(), scene.environment()
-    if not isinstance(bsdf, SiraBSDF):
+    if not isinstance(bsdf, sira_bsdf.SiraBSDF):
         raise InputError(f"{path}: the material of the neural_sdf is not a sira_bsdf, which both sides need")
-    if not all(isinstance(texture, NeuralAlbedo) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo)):
+    if not all(
+        isinstance(texture, neural_albedo.NeuralAlbedo) for texture in (bsdf.diffuse_albedo, bsdf.specular_albedo)
+    ):
         raise InputError(f"{path}: both albedos of the sira_bsdf must be neural_albedo textures")
-    if not isinstance(light, SGEnvmap) or len(scene.emitters()) != 1:
+    if not isinstance(light, sg_envmap.SGEnvmap) or len(scene.emitters()) != 1:
         raise InputError(f"{path}: the light must be one sg_envmap and nothing else; closed forms need that")
     if not scene.sensors():
         raise InputError(f"{path} holds no sensor; add a perspective one")
@@ -120,7 +119,7 @@ def _sensor(path: Path, sensor: mi.Sensor, size: int) -> tuple[dict, int, int]:
     return description, width, height
 
 
-def _world_lobes(light: SGEnvmap) -> np.ndarray:
+def _world_lobes(light: sg_envmap.SGEnvmap) -> np.ndarray:
     lobes = np.array(light.lobes.numpy(), np.float32).reshape(-1, 7)
     rotation = np.array(light.world_transform().matrix.numpy(), np.float64).reshape(4, 4)[:3, :3]
     lobes[:, :3] = lobes[:, :3] @ rotation.T
