@@ -62,7 +62,7 @@ def open_picture(path: Path, head: bytes, notes: list[str]) -> Image.Image:
             Image.MAX_IMAGE_PIXELS = limit
     if count > 1:
         notes.append(f"{path.name} holds {count} pictures: number {page} is read")
-    across, down = picture.info.get("aspect") or picture.info.get("dpi") or (1, 1)
+    across, down = map(float, picture.info.get("aspect") or picture.info.get("dpi") or (1, 1))
     if across > 0 and down > 0 and abs(across / down - 1) > 0.01:
         notes.append(f"{path.name} says that its pixels are not square ({across:g} by {down:g}): taken as square")
     return picture
