@@ -20,6 +20,7 @@ from sira_mi.errors import InputError
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
 from sira_mi.fit.memory import peak_memory
+from sira_mi.fit.output import label_tile
 from sira_mi.fit.rays import find_modelled_pixels, pixel_rays
 from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.state import FitState
@@ -78,6 +79,16 @@ def test_output_folder_is_complete_and_consistent(finished):
     stored = json.loads((finished / "lights.json").read_text())["lobes"]
     assert np.allclose([lobe["amplitude"] for lobe in stored], avatar.tensors["lobes"][:, 4:7], rtol=1e-5)
     assert avatar.k_s == 1 and avatar.k_r == 1 and "light_refinement" in avatar.tensors
+
+
+def test_every_tile_of_the_contact_sheet_has_a_legible_label():
+    """White on black in the lower left corner, whatever is behind it, and nothing beside it is changed."""
+    for grey in (0.0, 0.5, 1.0):
+        tile = label_tile(np.full((50, 50), grey), "diffuse albedo")
+        text = np.argwhere(tile.max(axis=2) > 0.7) if grey < 0.9 else np.argwhere(tile.min(axis=2) < 0.1)
+        assert tile.shape == (320, 320, 3) and len(text) > 100
+        assert text[:, 0].min() > 290 and 60 < np.ptp(text[:, 1]) < 160
+        assert np.abs(tile[:280] - grey).max() < 0.01
 
 
 @pytest.mark.slow

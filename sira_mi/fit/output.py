@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from sira_mi.colour import linear_to_srgb
 from sira_mi.export.scene import head, head_scene, orbit, sensor, sg_light
@@ -24,6 +24,15 @@ from sira_mi.sg.layers import split_layers
 _SAMPLES = 4
 # Side of a picture in the contact sheet, pixels.
 _TILE = 320
+# Layers of the contact sheet.
+_LAYER_LABELS = {
+    "final": "render",
+    "normal": "normal",
+    "diffuse_albedo": "diffuse albedo",
+    "specular_albedo": "specular albedo",
+}
+# Text of the contact sheet: its size and margin, pixels.
+_LABEL_SIZE, _LABEL_MARGIN = 15, 6
 # The second light of the contact sheet: a warm key from the upper left, a cool rim from behind, fill and a dim sky.
 SECOND_LIGHT = np.array(
     [
@@ -80,32 +89,36 @@ def crop_camera(camera: Camera, box: tuple[int, int, int, int]) -> Camera:
     return camera.crop(x0, y0, x1 - x0, y1 - y0).scale(scale, scale)
 
 
-def _tile(image: np.ndarray) -> np.ndarray:
-    """Display values [H, W, 3] or [H, W], fitted into a square of the contact sheet."""
+def label_tile(image: np.ndarray, label: str) -> np.ndarray:
+    """Display values [H, W, 3] or [H, W], fitted into a square of the contact sheet, with a label in a corner."""
     pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     scale = _TILE / max(image.shape[:2])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     canvas = Image.new("RGB", (_TILE, _TILE))
     resized = Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
     canvas.paste(resized, ((_TILE - size[0]) // 2, (_TILE - size[1]) // 2))
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(_LABEL_SIZE)
+    place = (_LABEL_MARGIN, _TILE - _LABEL_MARGIN)
+    left, top, right, bottom = draw.textbbox(place, label, font=font, anchor="ld")
+    draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill="black")
+    draw.text(place, label, fill="white", font=font, anchor="ld")
     return np.asarray(canvas) / 255
 
 
 def draw_contact_sheet(avatar_path: str, portrait: Portrait, layers: dict[str, np.ndarray], voxel: float) -> np.ndarray:
-    """Display values of the sheet, cropped to the head: photo, mask, final, normals / diffuse albedo, specular albedo,
-    the head turned both ways under a second light."""
+    """Display values of the sheet, cropped to the head, with labels: photo, mask, render, normals / diffuse albedo,
+    specular albedo, the head turned both ways under a second light."""
     box = head_box(np.maximum(layers["mask"], portrait.mask * (layers["mask"] > 0)))
     close = crop_camera(portrait.camera, box)
-    turned = []
+    x0, y0, x1, y1 = box
+    pictures = {"photo": linear_to_srgb(portrait.image), "mask of the photo": portrait.mask}
+    for name, label in _LAYER_LABELS.items():
+        pictures[label] = preview(name, layers[name], layers["mask"])
+    tiles = [label_tile(image[y0:y1, x0:x1], label) for label, image in pictures.items()]
     for yaw in (-30, 30):
         scene = load_avatar_scene(avatar_path, orbit(close, yaw), SECOND_LIGHT, voxel, extra_channels=False)
-        turned.append(linear_to_srgb(render_radiance(scene)))
-    x0, y0, x1, y1 = box
-    names = ("final", "normal", "diffuse_albedo", "specular_albedo")
-    shown = [preview(name, layers[name], layers["mask"]) for name in names]
-    framed = [image[y0:y1, x0:x1] for image in (linear_to_srgb(portrait.image), portrait.mask, *shown)]
-    rows = framed[:4], [*framed[4:], *turned]
-    return np.concatenate([np.concatenate([_tile(i) for i in row], axis=1) for row in rows], axis=0)
+        tiles.append(label_tile(linear_to_srgb(render_radiance(scene)), f"another light, turned {yaw:+d}°"))
+    return np.concatenate([np.concatenate(tiles[:4], axis=1), np.concatenate(tiles[4:], axis=1)], axis=0)
 
 
 def head_box(mask: np.ndarray) -> tuple[int, int, int, int]:
