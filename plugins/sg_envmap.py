@@ -53,9 +53,11 @@ class SGEnvmap(mi.Emitter):
     The sampling density is that of the whole mixture.
 
     It does not emit rays (`sample_ray`), so particle tracers such as `ptracer` cannot use it. It needs an RGB or
-    monochrome variant and a scene much smaller than 1e5 units, the distance at which the light is placed. Derivatives
-    flow through the radiance, not through the sampling. Inside Mitsuba's symbolic loops, gradients of `lobes` are
-    summed by atomics, and their last bits vary between runs.
+    monochrome variant and a scene much smaller than 1e5 units, the distance at which the light is placed. Axes are
+    scaled to unit length when the plugin is loaded; derivatives by `lobes` are those at the scaled axes. They flow
+    through the radiance, not through the sampling, and have no bias; where few samples meet a sharp lobe, those of one
+    rendering may be off by a third. Inside Mitsuba's symbolic loops, gradients of `lobes` are summed by atomics, and
+    their last bits vary between runs.
 
     Source: the light model of eq. 8 of SIRA (Caselles et al. 2022), after PhySG (Zhang et al. 2021).
 

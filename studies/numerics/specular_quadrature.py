@@ -112,8 +112,9 @@ def integrals(
     """The integrals [2, N] for F = 1 and F = P, n = z, views of `views` and light lobes of [N] sharpnesses and [N, 3]
     axes, with `nodes` nodes along a radius, a multiple of 8, and twice as many around."""
     result = np.empty((2, len(sharpness)))
-    # A light as sharp as the reflectance across its plane still varies less than the normal distribution.
-    follow_light = sharpness > 3.0 / roughness**4
+    # A light as sharp as the reflectance across its plane still varies less than the normal distribution. Seen at
+    # grazing angles, the reflectance is narrower across the plane, by about the mean cosine of view and half vectors.
+    follow_light = sharpness > 3.0 / (roughness**4 * np.sqrt(view_cosine**2 + 0.2 * roughness**4))
     for flag in (False, True):
         chosen = np.flatnonzero(follow_light == flag)
         for part in np.split(chosen, range(LAUNCH, len(chosen), LAUNCH)):
