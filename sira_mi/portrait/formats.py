@@ -1,8 +1,9 @@
 """Opens photo files: the formats that are photos, the page that is the picture, EXIF data, strips of its pixels."""
 
+import contextlib
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ _MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBX", "RGBA", "RGBa", "CMYK"
 _SUBFILE_TYPE, _BITS, _PHOTOMETRIC, _PLANAR, _WHITE_IS_ZERO = 254, 258, 262, 284, 0
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM, _EXIF_WIDTH, _EXIF_HEIGHT = 0x0112, 0x8769, 0xA405, 0xA002, 0xA003
 _SAME_ASPECT = 0.02  # of the longer side over the shorter: rounding while a photo is scaled
-_OPENING = threading.Lock()
+_PILLOW = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,18 @@ class Exif:
 
     orientation: int = 1  # 1 to 8
     focal_35mm: float | None = None  # mm
+
+
+@contextlib.contextmanager
+def _quiet_pillow() -> Iterator[None]:
+    """Without Pillow's warnings and its limit on pixels. Both belong to the whole process: one thread at a time."""
+    with _PILLOW, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def open_picture(path: Path, head: bytes, notes: list[str]) -> Image.Image:
@@ -44,10 +57,7 @@ def open_picture(path: Path, head: bytes, notes: list[str]) -> Image.Image:
 
         pi_heif.register_heif_opener()
         formats = ("HEIF",)
-    # Pillow's limit on pixels and Python's filters of warnings belong to the whole process.
-    with _OPENING, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    with _quiet_pillow():
         try:
             picture = Image.open(path, formats=formats)
             page = _seek_full_size(path, picture) if picture.format == "TIFF" else 1
@@ -58,8 +68,6 @@ def open_picture(path: Path, head: bytes, notes: list[str]) -> Image.Image:
             raise InputError(
                 f"{path} is not an image that can be read: save it as PNG, JPEG, or TIFF of RGB colours"
             ) from None
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
     if count > 1:
         notes.append(f"{path.name} holds {count} pictures: number {page} is read")
     across, down = map(float, picture.info.get("aspect") or picture.info.get("dpi") or (1, 1))
@@ -113,8 +121,9 @@ def check_mode(path: Path, picture: Any, deep: bool) -> None:
 def read_exif(path: Path, picture: Image.Image, stored: tuple[int, int], notes: list[str]) -> Exif:
     """Orientation and focal length; what is damaged, or no longer fits the pixels, is left out with a note."""
     try:
-        exif = picture.getexif()
-        lens = exif.get_ifd(_EXIF_IFD)
+        with _quiet_pillow():
+            exif = picture.getexif()
+            lens = exif.get_ifd(_EXIF_IFD)
         orientation = exif.get(_ORIENTATION, 1)
         focal = float(lens.get(_FOCAL_35MM) or 0)
         size = int(lens.get(_EXIF_WIDTH) or 0), int(lens.get(_EXIF_HEIGHT) or 0)
@@ -143,9 +152,20 @@ def read_strips(
     """Width and height, whether the decoder has oriented the pixels, and the reader of strips: coded colours
     `[h, w, 1 or 3]` and alpha `[h, w]`, uint8 or uint16; colours are not premultiplied."""
     if deep and encoding.profile is None and picture.mode != "CMYK":
+        if picture.format == "PNG":
+            _verify_checksums(path)
         size, strip = _read_strips_at_16_bits(path, picture)
         return size, False, strip
     return picture.size, picture.format == "TIFF", _read_strips_at_8_bits(picture, encoding)
+
+
+def _verify_checksums(path: Path) -> None:
+    """Raises `InputError` for a damaged PNG, of which libpng would write to the terminal."""
+    try:
+        with _quiet_pillow(), Image.open(path, formats=("PNG",)) as picture:
+            picture.verify()
+    except Exception:  # as for any damaged file
+        raise InputError(f"{path} is damaged: export it again") from None
 
 
 def _read_strips_at_8_bits(picture: Image.Image, encoding: Encoding) -> Strips:
@@ -170,14 +190,17 @@ def _read_strips_at_16_bits(path: Path, picture: Any) -> tuple[tuple[int, int], 
 
     options = oiio.ImageSpec()
     options.attribute("oiio:UnassociatedAlpha", 1)
+    damaged = InputError(f"{path} is damaged or truncated: export it again")
     file = oiio.ImageInput.open(str(path), options)
     page = picture.tell() if picture.format == "TIFF" else 0
     if file is None or not file.seek_subimage(page, 0):
-        raise InputError(f"{path} is damaged or truncated: export it again")
+        oiio.geterror()  # otherwise printed when the program ends
+        raise damaged
     spec = file.spec()
     pixels = file.read_image(page, 0, 0, spec.nchannels, oiio.UINT16)
     if pixels is None:
-        raise InputError(f"{path} is damaged or truncated: export it again")
+        file.geterror()
+        raise damaged
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
     colours = pixels[..., : 3 if spec.nchannels >= 3 else 1]
     if getattr(picture, "tag_v2", {}).get(_PHOTOMETRIC) == _WHITE_IS_ZERO:
