@@ -18,10 +18,10 @@ def locate_llvm() -> Path | None:
 
 
 def configure_llvm() -> None:
-    """Sets `DRJIT_LIBLLVM_PATH`, which Dr.Jit reads when it is imported, unless the user has set it.
+    """Sets `DRJIT_LIBLLVM_PATH`, which Dr.Jit reads when it is imported, unless the user has set it to a path.
 
     Warns when Dr.Jit is already imported: it may not have found this LLVM."""
-    if "DRJIT_LIBLLVM_PATH" in os.environ or (library := locate_llvm()) is None:
+    if os.environ.get("DRJIT_LIBLLVM_PATH") or (library := locate_llvm()) is None:
         return
     if "drjit" in sys.modules:
         warnings.warn(

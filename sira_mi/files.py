@@ -308,11 +308,10 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "software": _SOFTWARE}
 
     def write(file: Path) -> None:
-        try:
-            with OpenEXR.File(header, {"RGB" if pixels.ndim == 3 else "Y": pixels}) as output:
-                output.write(str(file))
-        except RuntimeError as error:
-            raise OSError(f"OpenEXR: {error}") from error
+        content = io.BytesIO()  # OpenEXR opens no paths that are not UTF-8
+        with OpenEXR.File(header, {"RGB" if pixels.ndim == 3 else "Y": pixels}) as output:
+            output.write(content)
+        file.write_bytes(content.getvalue())
 
     write_through(path, write)
 

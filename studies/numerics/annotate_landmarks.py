@@ -55,7 +55,10 @@ def attach(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="studies.numerics.annotate_landmarks", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="studies.numerics.annotate_landmarks",
+        description="Finds where the 468 face landmarks lie on the MakeHuman topology.",
+    )
     parser.add_argument("--out", type=Path, default=BARYCENTRICS, help=".npz file to write (default: the package's)")
     parser.add_argument("--heads", type=int, default=16)
     arguments = parser.parse_args()

@@ -183,7 +183,7 @@ def difference(name: str, rows: np.ndarray, shipped, half_point: float) -> float
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description="Fits the polynomials of `sira_mi/sg/integrals.py` to quadrature.")
     parser.add_argument("--check", action="store_true", help="compare with the constants of the package")
     arguments = parser.parse_args()
     sharpness, cosine, clamped, step, peak = samples()

@@ -215,7 +215,7 @@ def check(samples: Samples, tables: dict[str, np.ndarray]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description="Computes the tables of `sira_mi/sg/specular_table.py`.")
     action = parser.add_mutually_exclusive_group()
     action.add_argument("--check", action="store_true", help="compare with the tables of the package")
     action.add_argument("--write", action="store_true", help="put the tables into the package's file")

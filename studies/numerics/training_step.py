@@ -85,7 +85,7 @@ def ceiling(width: int, columns: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser = argparse.ArgumentParser(description="How fast the shape model trains")
     parser.add_argument("--width", type=int, default=AvatarArchitecture().sdf_width)
     parser.add_argument("--points", type=int, help="points a step (default: the training's)")
     arguments = parser.parse_args()

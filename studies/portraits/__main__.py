@@ -17,7 +17,10 @@ from studies.data import read_figures, write_figures
 
 
 def main() -> None:
-    parser = CommandParser(prog="python -m studies.portraits", description=__doc__.split("\n")[0])
+    parser = CommandParser(
+        prog="python -m studies.portraits",
+        description="Portraits of known heads, and how close fits come.",
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     portraits = commands.add_parser("build", help="build or resume the benchmark of portraits")
     portraits.add_argument("--collection", type=Path, required=True, help="folder whose test heads are photographed")
@@ -77,16 +80,15 @@ def main() -> None:
 
 def compare_fits(arguments: argparse.Namespace) -> None:
     """Fits and scores the benchmark's portraits as the command line says; writes figures, picture and page."""
-    import mitsuba as mi
-
     from sira_mi.avatar.file import PRIOR
+    from sira_mi.variants import set_variant
     from studies.portraits.compare_methods import Comparison, compare
     from studies.portraits.methods import BY_NAME
     from studies.portraits.page import FIGURES
     from studies.portraits.picture import write_picture
     from studies.portraits.summary import SHIPPED, summarise
 
-    mi.set_variant(arguments.variant)
+    set_variant(arguments.variant)
 
     def rows(quality: str, methods: tuple[str, ...]) -> list[dict]:
         comparison = Comparison(
@@ -121,10 +123,11 @@ def write_results(arguments: argparse.Namespace) -> None:
 
 def print_skin_level(arguments: argparse.Namespace) -> None:
     """Prints how well the cues of `sira_mi.fit.skin` predict the skin's albedo, over a benchmark's portraits."""
-    import mitsuba as mi
     import numpy as np
 
-    mi.set_variant(arguments.variant)
+    from sira_mi.variants import set_variant
+
+    set_variant(arguments.variant)
     from studies.portraits.measure_skin import estimate, observe
 
     observations, blind = observe(arguments.benchmark)
@@ -137,9 +140,9 @@ def print_skin_level(arguments: argparse.Namespace) -> None:
 
 def correct_landmarks(arguments: argparse.Namespace) -> None:
     """Writes the correction of detected landmarks and the prior with its landmark model; prints the errors of both."""
-    import mitsuba as mi
+    from sira_mi.variants import set_variant
 
-    mi.set_variant(arguments.variant)
+    set_variant(arguments.variant)
     from sira_mi.avatar.file import load_avatar, save_avatar
     from sira_mi.portrait.head_landmarks import CORRECTION
     from sira_mi.training.scenes import load_training_scenes

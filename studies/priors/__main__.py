@@ -18,7 +18,10 @@ from studies.priors.page import FIGURES, write_pages
 
 
 def main() -> None:
-    parser = CommandParser(prog="python -m studies.priors", description=__doc__.split("\n")[0])
+    parser = CommandParser(
+        prog="python -m studies.priors",
+        description="Measures a trained prior, short trainings and network sizes.",
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     prior = commands.add_parser("measure", help="measure the prior and the ablations, write figures and pages")
     sizes = commands.add_parser("sizes", help="train and measure networks of several sizes, write figures and pages")
@@ -42,14 +45,13 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> None:
     """Runs the measurements of the command line; writes the figures and copies the pictures."""
-    import mitsuba as mi
-
+    from sira_mi.variants import set_variant
     from studies.priors.measure_appearance import measure_appearance_prior, run_appearance_ablations
     from studies.priors.measure_shape import measure_shape_prior
     from studies.priors.short_trainings import run_ablations, run_sizes
     from studies.priors.summary import summarise
 
-    mi.set_variant(arguments.variant)
+    set_variant(arguments.variant)
     evidence = arguments.runs / "evidence"
     if arguments.command == "measure":
         measure_shape_prior(arguments.collection, arguments.runs)

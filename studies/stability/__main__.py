@@ -11,7 +11,10 @@ from sira_mi.errors import CommandParser, InputError, run_command
 
 
 def main() -> int:
-    parser = CommandParser(prog="python -m studies.stability", description=__doc__.split("\n")[0])
+    parser = CommandParser(
+        prog="python -m studies.stability",
+        description="Measures numerical stability, writes the figures and their page.",
+    )
     parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
     parser.add_argument("--work", type=Path, default=Path("build/stability"), help="folder of portraits and fits")
     parser.add_argument("--only", nargs="+", metavar="SECTION", help="measure only these sections: fits, tracing, ...")
@@ -21,9 +24,9 @@ def main() -> int:
     if not arguments.out.is_dir():
         raise InputError(f"{arguments.out} is not a folder; make it, or give another with --out")
 
-    import mitsuba as mi
+    from sira_mi.variants import set_variant
 
-    mi.set_variant(arguments.variant)
+    set_variant(arguments.variant)
 
     from studies.stability.page import Measured, load_rows, write_page
     from studies.stability.sections import list_sections
