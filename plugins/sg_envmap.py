@@ -1,13 +1,17 @@
 """The emitter `sg_envmap`: an environment of spherical Gaussians."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from sira_mi.avatar.decoders import light_refinement
+from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
+from sira_mi.fields.mlp import layers
+from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
 from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
 from sira_mi.sg.sampling import LobeMixture
@@ -16,6 +20,27 @@ from sira_mi.sg.sampling import LobeMixture
 FAR_DISTANCE = 1e5
 # Dim and near-constant: the light when no lobes are given.
 DEFAULT_LOBES = np.array([[0.0, 1.0, 0.0, 1e-3, 0.2, 0.2, 0.2]])
+
+
+class LightRefinement(NamedTuple):
+    """The network of an avatar that refines its light."""
+
+    network: list[tuple]
+    octaves: int
+
+    def factor(self, x_ref, gamma):
+        """Factor of the radiance [3, N] at points of the reference space."""
+        return dr.exp(light_refinement(self.network, self.octaves, x_ref, gamma))
+
+
+def read_refinement(path: str) -> LightRefinement | None:
+    """The light refinement of an avatar file; None without a path and where the avatar has none."""
+    avatar = load_avatar(path) if path else None
+    if avatar is None or "light_refinement" not in avatar.tensors:
+        return None
+    network = avatar.architecture.networks["light_refinement"]
+    parameters = mi.Float(avatar.tensors["light_refinement"])
+    return LightRefinement(layers(network, parameters), avatar.architecture.refinement_octaves)
 
 
 class SGEnvmap(mi.Emitter):
@@ -38,6 +63,11 @@ class SGEnvmap(mi.Emitter):
      * - lobe_count
        - |int|
        - Number of lobes fitted to an `.exr`. (Default: 64)
+
+     * - light_refinement
+       - |string|
+       - An `avatar.safetensors` whose fitted light this is. `sira_sg` multiplies the radiance of the head by the
+         avatar's refinement of that light; other integrators ignore it. (Default: none)
 
      * - scale
        - |float|
@@ -83,6 +113,7 @@ class SGEnvmap(mi.Emitter):
         else:
             lobes = check_lobes(np.array(props["lobes"]) if "lobes" in props else DEFAULT_LOBES, "sg_envmap")
         self.lobes = mi.TensorXf(lobes)
+        self.refinement = read_refinement(find_avatar(props, "light_refinement"))
         self._prepare()
 
     @staticmethod

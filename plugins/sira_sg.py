@@ -1,14 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.decoders import light_refinement
-from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import (
     evaluate_in_chunks,
@@ -19,12 +16,11 @@ from sira_mi.fields.columns import (
     to_array,
     to_columns,
 )
-from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
 from sira_mi.plugins.neural_sdf import find_head, trace_head
-from sira_mi.plugins.sg_envmap import SGEnvmap
+from sira_mi.plugins.sg_envmap import LightRefinement, SGEnvmap, read_refinement
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg.layers import EXTRA_LAYERS, channel_count, extra_channel_names
 from sira_mi.sg.multisampling import representative_samples
@@ -71,7 +67,8 @@ class SiraSG(mi.SamplingIntegrator):
      * - light_refinement
        - |string|
        - An `avatar.safetensors` whose light refinement multiplies the radiance: the part of the photo that neither
-         eq. 8 nor the albedo explains. It is only valid under that avatar's fitted light. (Default: none)
+         eq. 8 nor the albedo explains. It is only valid under that avatar's fitted light.
+         (Default: that of the `sg_envmap`)
      * - shaded_lobes
        - |tensor|
        - Indices of the lobes that the closed form sums over. Visibility always uses all lobes. (Default: all)
@@ -126,6 +123,7 @@ class SiraSG(mi.SamplingIntegrator):
             raise RuntimeError("sira_sg: the neural_sdf must have a sira_bsdf; use path for other materials")
         if not isinstance(light, SGEnvmap):
             raise RuntimeError("sira_sg: the environment must be an sg_envmap; use path for other lights")
+        refinement = self.refinement_of(light)
         ray = mi.Ray3f(ray)
         width = dr.width(ray.o, ray.d)
         attached = dr.grad_enabled(ray.o, ray.d) or has_gradients(head, light)
@@ -143,7 +141,7 @@ class SiraSG(mi.SamplingIntegrator):
 
         # Scatter: from the columns back to the rays.
         parts, row = {}, 0
-        for name, rows in self.rows().items():
+        for name, rows in self.rows(refinement).items():
             kind = mi.Color3f if rows == 3 else mi.Float
             part = dr.zeros(kind, width)
             if columns is not None:
@@ -152,7 +150,7 @@ class SiraSG(mi.SamplingIntegrator):
             row += rows
         t, hit = hits.spread(hits.t), hits.spread(hits.shaded)
         radiance = parts["diffuse"] + parts["specular"]
-        if self.refinement is not None:
+        if refinement is not None:
             radiance *= parts["light_refinement"]
 
         # Background, and what the film takes.
@@ -169,11 +167,15 @@ class SiraSG(mi.SamplingIntegrator):
         extra = (parts[name] for name in EXTRA_LAYERS)
         return color, valid, [c for part in extra for c in (part if isinstance(part, mi.Color3f) else [part])]
 
-    def rows(self) -> dict[str, int]:
+    def refinement_of(self, light: SGEnvmap) -> LightRefinement | None:
+        """The refinement of the light that multiplies the radiance: the integrator's, or else the light's own."""
+        return self.refinement or light.refinement
+
+    def rows(self, refinement: LightRefinement | None) -> dict[str, int]:
         """Number of rows of each layer in the tensor that `HeadShader` returns."""
         names = ["diffuse", "specular", *(("diffuse_albedo", "specular_albedo", "normal") if self.aovs else ())]
-        refinement = {} if self.refinement is None else {"light_refinement": 3}
-        return {name: channel_count(name) for name in names} | refinement
+        factor = {} if refinement is None else {"light_refinement": 3}
+        return {name: channel_count(name) for name in names} | factor
 
     def select_lobes(self, lobes):
         """Those of `lobes` [N_l, 7] that the closed form sums over. Raises InputError for an index that they lack."""
@@ -194,27 +196,6 @@ class SiraSG(mi.SamplingIntegrator):
 def has_gradients(*objects: mi.Object) -> bool:
     """Whether gradients are enabled for a parameter that one of the objects, or one nested in it, exposes."""
     return any(dr.grad_enabled(value) for one in objects for _, value in mi.traverse(one))
-
-
-class LightRefinement(NamedTuple):
-    """The network of an avatar that refines its light."""
-
-    network: list[tuple]
-    octaves: int
-
-    def factor(self, x_ref, gamma):
-        """Factor of the radiance [3, N] at points of the reference space."""
-        return dr.exp(light_refinement(self.network, self.octaves, x_ref, gamma))
-
-
-def read_refinement(path: str) -> LightRefinement | None:
-    """The light refinement of an avatar file; None without a path and where the avatar has none."""
-    avatar = load_avatar(path) if path else None
-    if avatar is None or "light_refinement" not in avatar.tensors:
-        return None
-    network = avatar.architecture.networks["light_refinement"]
-    parameters = mi.Float(avatar.tensors["light_refinement"])
-    return LightRefinement(layers(network, parameters), avatar.architecture.refinement_octaves)
 
 
 # Hits
@@ -265,6 +246,7 @@ class HeadShader:
     def __init__(self, integrator: SiraSG, scene, head, light, attached: bool):
         self.integrator, self.scene, self.head, self.attached = integrator, scene, head, attached
         self.bsdf, self.field = head.bsdf(), head.field()
+        self.refinement = integrator.refinement_of(light)
         self.specular_term = attached or self.bsdf.k_s.numpy().item() != 0
         self.lobes = local_lobes(light, head)
         self.shaded_lobes = self.lobes if attached else integrator.select_lobes(self.lobes)
@@ -291,7 +273,7 @@ class HeadShader:
         direction = gather_columns((self.head.to_local @ ray).d, index)
         x, normal = to_columns(self.head.to_local @ si.p), to_local @ to_columns(si.sh_frame.n)
         columns = [x, direction, normal, *mesh_albedos(self.head, self.bsdf, si, x)]
-        if (refinement := self.integrator.refinement) is not None:
+        if (refinement := self.refinement) is not None:
             factor = evaluate_in_chunks(lambda p: refinement.factor(*deform(self.field, p)), x.numpy())[0]
             columns.append(mi.TensorXf(factor))
         return mi.TensorXf(evaluate_in_chunks(self._shade_points, *(c.numpy() for c in columns))[0])
@@ -303,7 +285,7 @@ class HeadShader:
         specular = None
         if self.specular_term or self.integrator.aovs:
             specular = self._albedo(self.bsdf.specular_albedo, x, x_ref, gamma, 1)
-        refinement = self.integrator.refinement
+        refinement = self.refinement
         factor = [] if refinement is None else [refinement.factor(x_ref, gamma)]
         return self._shade_points(x, direction, normalise(gradient), diffuse, specular, *factor)
 

@@ -17,10 +17,27 @@ _PLUGINS = {
     "diffuse_albedo": ("texture", "name"),
     "specular_albedo": ("texture", "name"),
 }
-_COMMENT = """A head fitted by SIRA for Mitsuba 3: import sira_mi; mitsuba.load_file("scene.xml", integrator="path")
+_COMMENT = """The fitted photo as a scene: the picture of renders/final.
 
-     Baked albedos are interpolated between the vertices of the mesh and have no gradients: fast for path, ignored by
-     sira_sg."""
+     In Python:
+         import sira_mi
+         import mitsuba
+         mitsuba.set_variant("llvm_ad_rgb")
+         scene = mitsuba.load_file("scene.xml", spp=64)
+         mitsuba.util.write_bitmap("photo.png", mitsuba.render(scene))
+
+     Parameters of load_file:
+         integrator      sira_sg (closed form), path, or another; all but sira_sg ignore the refinement of the light
+         hide_emitters   true: black behind the head; false: the environment
+         spp             samples a pixel
+         width, height   of the picture, pixels; the frame of the photo has their ratio
+         avatar          the head's file
+         lights          .json (lobes) or .exr (environment)
+         refinement      the avatar whose refinement of the light is applied; an empty text under another light
+         voxel           of the mesh, units of 100 mm
+         baked           albedos of the vertices for path: fast, but without gradients; sira_sg evaluates the networks
+
+     Paths are relative to this file or to the current folder."""
 _VALUES = {bool: "boolean", int: "integer", float: "float", str: "string"}
 
 
@@ -29,8 +46,13 @@ def scene_of_fit(camera: Camera) -> dict:
     eye = sensor(camera, {"type": "independent", "sample_count": Parameter("spp", 16)})
     eye["film"] |= {"width": Parameter("width", camera.width), "height": Parameter("height", camera.height)}
     shape = head(Parameter("avatar", "avatar.safetensors"), Parameter("voxel", 0.05), Parameter("baked", True))
-    light = {"type": "sg_envmap", "filename": Parameter("lights", "lights.json")}
-    return head_scene({"type": Parameter("integrator", "sira_sg")}, eye, shape, light)
+    light = {
+        "type": "sg_envmap",
+        "filename": Parameter("lights", "lights.json"),
+        "light_refinement": Parameter("refinement", "avatar.safetensors"),
+    }
+    integrator = {"type": Parameter("integrator", "sira_sg"), "hide_emitters": Parameter("hide_emitters", True)}
+    return head_scene(integrator, eye, shape, light)
 
 
 def scene_xml(description: dict, comment: str) -> str:
