@@ -18,6 +18,7 @@ from PIL import Image
 from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.colour import linear_to_srgb
 from sira_mi.errors import InputError
+from sira_mi.files import write_exr
 from sira_mi.fit import settings as fit_settings
 from sira_mi.fit.driver import Progress, load_progress, save_progress
 from sira_mi.fit.memory import peak_memory
@@ -26,6 +27,7 @@ from sira_mi.fit.rays import find_modelled_pixels, pixel_rays
 from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
+from sira_mi.portrait.load import srgb_to_linear
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import psnr
 
@@ -119,6 +121,30 @@ def test_only_what_each_stage_names_is_moved(finished):
         assert np.array_equal(prior.tensors[name], avatar.tensors[name])
     for name in ("deformation", "rendering", "albedo_refinement", "z_sdf", "z_r", "z_a", "z_s", "z_l"):
         assert not np.array_equal(prior.tensors[name], avatar.tensors[name])
+
+
+@pytest.mark.slow
+def test_a_photo_in_another_unit_of_radiance_gives_the_same_head(fit, tmp_path):
+    """Shape and albedo to the bit, the light and the renders in the photo's unit, the previews alike."""
+    photo = srgb_to_linear(skimage.data.astronaut()[:256, 90:346] / 255)
+    factor, outs = 1024, (tmp_path / "one", tmp_path / "other")
+    for out, image in zip(outs, (photo, photo * np.float32(factor)), strict=True):
+        write_exr(tmp_path / "photo.exr", image)
+        assert fit(out, photo=tmp_path / "photo.exr") == 0
+    one, other = (load_avatar(out / "avatar.safetensors").tensors for out in outs)
+    lobes = {key: tensors.pop("lobes") for key, tensors in (("one", one), ("other", other))}
+    assert all(np.array_equal(value, other[name]) for name, value in one.items())
+    assert np.array_equal(lobes["one"][:, :4], lobes["other"][:, :4])
+    np.testing.assert_allclose(lobes["one"][:, 4:] * factor, lobes["other"][:, 4:], rtol=1e-6)
+    for name, expected in {"final": factor, "diffuse": factor, "specular": factor, "diffuse_albedo": 1}.items():
+        images = [np.array(mi.Bitmap(str(out / "renders" / f"{name}.exr"))) for out in outs]
+        np.testing.assert_allclose(images[1], images[0] * expected, rtol=1e-4, atol=1e-5 * expected)
+    for name in ("input.png", "renders/final.png"):
+        first, second = (np.asarray(Image.open(out / name)).astype(int) for out in outs)
+        assert np.abs(first - second).max() <= 1
+    reports = [json.loads((out / "avatar.json").read_text()) for out in outs]
+    assert reports[0]["exposure"] == pytest.approx(reports[1]["exposure"] * factor)
+    assert reports[0]["psnr_inside_mask_db"] == pytest.approx(reports[1]["psnr_inside_mask_db"], abs=0.02)
 
 
 @pytest.mark.slow

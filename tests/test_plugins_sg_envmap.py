@@ -320,9 +320,36 @@ def test_bad_environment_files_are_named(tmp_path):
     image[3, 4, 1] = np.nan
     write_exr(path, image)
     expect("not finite")
+    image[3, 4, 1] = -np.inf
+    write_exr(path, image)
+    expect("not finite")
+    image[3, 4, 1] = 1e30
+    write_exr(path, image)
+    expect("more than 1e.28")
+    image[3] = -1
+    write_exr(path, image)
+    expect("negative radiance")
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": np.ones((16, 32), np.float32)}) as file:
         file.write(str(path))
     expect("no channels")
+
+
+def test_environments_are_read_as_their_files_say(tmp_path):
+    """Overshoot below zero becomes black; a part of the sphere stays in its place, the rest is black; so is a picture
+    that reaches beyond the display window cut to it."""
+    path, rng = tmp_path / "lights.exr", np.random.default_rng(0)
+    image = rng.random((16, 32, 3)).astype(np.float32)
+    image[5, 6] = -0.01
+    write_exr(path, image)
+    np.testing.assert_array_equal(lights_io.read_environment(path), np.maximum(image, 0))
+    whole = np.zeros((64, 128, 3), np.float32)
+    whole[16:48, 64:] = rng.random((32, 64, 3))
+    cases = {(64, 16, 127, 47): whole[16:48, 64:], (-2, -1, 129, 64): np.pad(whole, ((1, 1), (2, 2), (0, 0)), "edge")}
+    for (left, top, right, bottom), stored in cases.items():
+        corners = [np.array(c, np.int32) for c in ((left, top), (right, bottom), (0, 0), (127, 63))]
+        header = {"dataWindow": tuple(corners[:2]), "displayWindow": tuple(corners[2:])}
+        OpenEXR.File(header, {"RGB": np.ascontiguousarray(stored)}).write(str(path))
+        np.testing.assert_array_equal(lights_io.read_environment(path), whole)
 
 
 def test_unwritable_output_leaves_nothing(tmp_path):

@@ -11,6 +11,7 @@ from PIL import Image
 from sira_mi.colour import linear_to_srgb, srgb_to_linear
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
+from sira_mi.files import write_exr
 from sira_mi.portrait.camera import estimate_camera, measure_reprojection_error
 from sira_mi.portrait.face import find_faces, select_face
 from sira_mi.portrait.load import load_photo
@@ -373,3 +374,35 @@ def test_exif_rotated_cmyk_and_dark_exr_photos_give_the_same_face(tmp_path, astr
         portrait = make_portrait(tmp_path / name, PortraitSettings(working_size=256), head)
         assert np.linalg.norm(portrait.landmarks * 2 - face.landmarks, axis=1).mean() < 2.5, name
         assert portrait.mask[20:40, 100:130].mean() > 0.9 and portrait.mask[:60, 180:].mean() < 0.05, name
+
+
+@pytest.mark.parametrize("factor", [1024.0, 1000.0, 2.0**-10])
+def test_radiance_is_exposed_alike_in_every_unit(tmp_path, astronaut, head, head_mask, factor):
+    """The portrait of an EXR is the same in another unit, to the bit where the unit is a power of two; what is coded
+    for a display stays as it is."""
+    Image.fromarray(head_mask).save(tmp_path / "mask.png")
+    linear = srgb_to_linear(astronaut / 255.0).astype(np.float32)
+    portraits = []
+    for name, image in (("one.exr", linear), ("other.exr", linear * np.float32(factor))):
+        write_exr(tmp_path / name, image)
+        portraits.append(make_portrait(tmp_path / name, SETTINGS, head, tmp_path / "mask.png"))
+    one, other = portraits
+    assert other.exposure * factor == pytest.approx(one.exposure, rel=1e-6)
+    np.testing.assert_allclose(one.image, linear * one.exposure, rtol=1e-6)
+    np.testing.assert_allclose(other.image, one.image, rtol=1e-6)
+    if factor != 1000:
+        assert np.array_equal(other.image, one.image) and np.array_equal(other.landmarks, one.landmarks)
+        assert np.array_equal(other.camera.K, one.camera.K)
+    assert any("stores radiance" in note for note in other.notes)
+
+
+@pytest.mark.slow
+def test_exposures_of_coded_and_of_black_photos(tmp_path, astronaut, head, head_mask, face):
+    """A dark photo that is coded for a display is not exposed anew, nor is a black one with radiance."""
+    Image.fromarray(head_mask).save(tmp_path / "mask.png")
+    (tmp_path / "camera.json").write_text(estimate_camera(face.landmarks, head, 512, 512).to_json())
+    Image.fromarray(astronaut // 8).save(tmp_path / "dark.png")
+    write_exr(tmp_path / "black.exr", np.zeros((512, 512, 3)))
+    for name in ("dark.png", "black.exr"):
+        given = tmp_path / "mask.png", tmp_path / "camera.json"
+        assert make_portrait(tmp_path / name, SETTINGS, head, *given).exposure == 1

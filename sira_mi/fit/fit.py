@@ -37,6 +37,7 @@ from sira_mi.portrait.portrait import Portrait, PortraitSettings, make_portrait
 from sira_mi.relight.pictures import preview, psnr_inside
 from sira_mi.sg.fit_environment import render_environment
 from sira_mi.sg.lights_io import write_lights
+from sira_mi.sg.lobes import scale_lobes
 from sira_mi.variants import set_variant
 
 # Files of an unfinished fit, inside the output folder.
@@ -102,7 +103,7 @@ def _fit_in_folder(request: FitRequest, work: Path, started: float) -> bool:
     seconds_portrait = time.monotonic() - started
 
     progress, complete = run_fit(request, task)
-    avatar = assemble_avatar(task.prior, progress, task.settings)
+    avatar = assemble_avatar(task.prior, progress, task.settings, task.portrait.exposure)
     save_avatar(request.out / "avatar.safetensors", avatar)
     report = {
         "quality": request.quality,
@@ -235,11 +236,12 @@ def identify(task: FitTask, seed: int) -> str:
     return digest.hexdigest()
 
 
-def assemble_avatar(prior: Avatar, progress: Progress, settings: FitSettings) -> Avatar:
-    """The avatar at the fit's last parameters, its light decoded to lobes; k_s and k_r are those of the last stage that
-    was reached."""
+def assemble_avatar(prior: Avatar, progress: Progress, settings: FitSettings, exposure: float = 1.0) -> Avatar:
+    """The avatar at the fit's last parameters, its light decoded to lobes, in the unit of a photo that was fitted at
+    `exposure`; k_s and k_r are those of the last stage that was reached."""
     parameters = progress.state.avatar
     lobes = decode_lobes(prior, {k: mi.Float(parameters[k]) for k in ("illumination", "z_l")}).numpy()
+    lobes = scale_lobes(lobes, 1 / exposure)
     reached = settings.stages[min(progress.stage, len(settings.stages) - 1)]
     return replace(prior.with_tensors(**parameters, lobes=lobes), k_s=reached.k_s[1], k_r=reached.k_r)
 
@@ -256,10 +258,11 @@ def write_folder(
     write_exr(out / "lights.exr", render_environment(lobes, 128))
     write_scene(out / "scene.xml", portrait.camera)
 
-    scene = output.load_avatar_scene(str(avatar_path), portrait.camera, lobes, settings.final_voxel, in_photo=True)
+    exposed = scale_lobes(lobes, portrait.exposure)
+    scene = output.load_avatar_scene(str(avatar_path), portrait.camera, exposed, settings.final_voxel, in_photo=True)
     write_mesh(out / "mesh.ply", scene.shapes()[0])
     layers = output.render_layers(scene)
-    output.write_renders(out / "renders", layers)
+    output.write_renders(out / "renders", layers, portrait.exposure)
     write_png(out / "input.png", preview("final", portrait.image, portrait.mask))
     write_png(out / "contact.png", output.draw_contact_sheet(str(avatar_path), portrait, layers, settings.voxel))
 
@@ -268,6 +271,7 @@ def write_folder(
     report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
     report["psnr_of_unrefined_light_db"] = round(psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
+    report["exposure"] = portrait.exposure
     report["seconds"]["output"] = round(time.monotonic() - begun, 2)
     report["seconds"]["total"] = round(time.monotonic() - started, 2)
     report["peak_memory_megabytes"] = round(peak_memory() / 2**20)

@@ -22,6 +22,7 @@ from sira_mi.sg.layers import split_layers
 
 # Samples a pixel of the closed-form renders.
 _SAMPLES = 4
+_RADIANCE = ("final", "diffuse", "specular")
 # Side of a picture in the contact sheet, pixels.
 _TILE = 320
 # Layers of the contact sheet.
@@ -72,13 +73,14 @@ def load_avatar_scene(
     return mi.load_dict(head_scene(integrator, eye, head(avatar_path, voxel), sg_light(lobes)))
 
 
-def write_renders(folder: Path, layers: dict[str, np.ndarray]) -> None:
-    """Makes `folder` and writes `NAME.exr` with PNG previews, and `mask.png`, into it."""
+def write_renders(folder: Path, layers: dict[str, np.ndarray], exposure: float = 1.0) -> None:
+    """Makes `folder` and writes `NAME.exr` with PNG previews, and `mask.png`, into it. Radiance in `layers` is
+    `exposure` times that of the files; previews show it as it is."""
     with contextlib.suppress(FileExistsError):
         folder.mkdir()
     for name, image in layers.items():
         if name != "mask":
-            write_exr(folder / f"{name}.exr", image)
+            write_exr(folder / f"{name}.exr", image / exposure if name in _RADIANCE else image)
         write_png(folder / f"{name}.png", preview(name, image, layers["mask"]))
 
 

@@ -45,6 +45,7 @@ class Photo:
     full_size: tuple[int, int]  # width and height after orientation, pixels
     reduction: int  # file pixels per image pixel along each axis
     notes: tuple[str, ...]
+    is_radiance: bool = False  # in a unit of the file's own, other than colours coded for a display
 
 
 def orient(image: np.ndarray, orientation: int) -> np.ndarray:
@@ -190,7 +191,7 @@ def _load_exr(path: Path, max_pixels: int) -> Photo:
     if alpha is not None:
         alpha = _block_mean(alpha[:rows, :columns, None], factor)[..., 0]
     size = (width, height)
-    return Photo(np.maximum(image, 0), alpha, None, 1, size, size, factor, ())
+    return Photo(np.maximum(image, 0), alpha, None, 1, size, size, factor, (), is_radiance=True)
 
 
 def _one_line(error: Exception) -> str:

@@ -20,6 +20,7 @@ _MIN_FACE_SHARE = 0.2  # of the working size; below it the photo is cropped to t
 _WINDOW = 4.5  # side of that crop, in face sizes
 _FACE_POSITION = 0.42  # height of the face's centre in that crop, from its top
 _LARGEST_ROLL = 60.0  # degrees; the mask's network knows people who stand or sit
+_BRIGHT = 0.8  # linear; a well exposed photo has few pixels that are brighter
 _CAMERA_MISMATCH = 0.25  # in face sizes; a given camera that is further off earns a note
 
 
@@ -31,12 +32,13 @@ class PortraitSettings:
 
 @dataclass(frozen=True, eq=False)
 class Portrait:
-    image: np.ndarray  # [H, W, 3] float32, linear Rec.709
+    image: np.ndarray  # [H, W, 3] float32, linear Rec.709, `exposure` times the photo's
     mask: np.ndarray  # [H, W] float32 in [0, 1], 1 is the person
     landmarks: np.ndarray  # [468, 2] float64, pixels of `image`, as the network finds them; NaN without a face
     head_landmarks: np.ndarray  # [468, 2] likewise, corrected to those of the head, hidden ones included
     camera: Camera  # of `image`, with square pixels
     notes: tuple[str, ...]  # messages for the user, one line each
+    exposure: float = 1.0  # other than 1 only for photos that store radiance, whose unit is arbitrary
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,11 @@ def make_portrait(
     """
     photo = load_photo(path, settings.max_pixels)
     notes = list(photo.notes)
+    exposure = 1.0
+    if photo.is_radiance:
+        exposure = _find_exposure(photo.image)
+        photo = replace(photo, image=photo.image * np.float32(exposure))
+        notes.append(f"the photo stores radiance: fitted at {exposure:.3g} times its values, written in its own unit")
     given_camera = None if camera_path is None else _read_camera(camera_path, photo)
     given_mask = None if mask_path is None else load_mask(mask_path, photo, settings.max_pixels)
 
@@ -110,16 +117,28 @@ def make_portrait(
         error = measure_reprojection_error(camera, of_head, np.asarray(mean_landmarks, np.float64))
         if error > _CAMERA_MISMATCH * working_face.size:
             notes.append(f"the given camera shows the head {error:.0f} pixels away from the face in the photo")
-    return Portrait(image.astype(np.float32), mask.astype(np.float32), landmarks, of_head, camera, tuple(notes))
+    image, mask = image.astype(np.float32), mask.astype(np.float32)
+    return Portrait(image, mask, landmarks, of_head, camera, tuple(notes), exposure)
 
 
 def make_display_image(image: np.ndarray) -> np.ndarray:
     """A linear image `[H, W, 3]` as sRGB uint8 for the networks; a far too dark or bright one is exposed anew."""
-    bright = float(np.percentile(image[::4, ::4] @ np.array(LUMINANCE, np.float32), 99))
-    exposure = 0.8 / bright if bright > 0 and not 0.1 <= bright <= 1.0 else 1.0
+    bright = _measure_brightness(image)
+    exposure = _BRIGHT / bright if bright > 0 and not 0.1 <= bright <= 1.0 else 1.0
     return np.concatenate(
         [(linear_to_srgb(rows * exposure) * 255 + 0.5).astype(np.uint8) for rows in np.array_split(image, 8)]
     )
+
+
+def _measure_brightness(image: np.ndarray) -> float:
+    """A luminance that few of the image's pixels exceed."""
+    return float(np.percentile(image[::4, ::4] @ np.array(LUMINANCE, np.float32), 99))
+
+
+def _find_exposure(image: np.ndarray) -> float:
+    """The factor of a linear image `[H, W, 3]` that makes it as bright as photos are; 1 for a black one."""
+    bright = _measure_brightness(image)
+    return _BRIGHT / bright if bright > 0 else 1.0
 
 
 def halve(portrait: Portrait) -> Portrait:

@@ -14,6 +14,10 @@ from sira_mi.files import check_file, read_exr, read_json, write_through
 MAXIMUM_LOBES = 4096
 # Width and height of an environment image that is still read.
 _MAXIMUM_SIDE = 32768
+# Of an environment image: sums over its pixels stay finite in float32.
+_MAXIMUM_RADIANCE = 1e28
+# Negative light, against the positive, that resampling and conversions of colours leave.
+_NEGATIVE_SHARE = 0.01
 _FIELDS = (("axis", 3), ("sharpness", 1), ("amplitude", 3))
 
 
@@ -76,7 +80,9 @@ def write_lights(path: str | Path, lobes: np.ndarray) -> None:
 
 
 def read_environment(path: str | Path) -> np.ndarray:
-    """Radiance `[H, W, 3]` (float32) of a latitude-longitude OpenEXR; InputError unless it is finite and about 2:1."""
+    """Radiance `[H, W, 3]` (float32) of a latitude-longitude OpenEXR; slightly negative values become 0.
+
+    Raises InputError unless it is finite, about 2:1 and of positive light."""
     path = check_file(path, "light")
 
     def check_size(width: int, height: int) -> None:
@@ -84,4 +90,9 @@ def read_environment(path: str | Path) -> np.ndarray:
             raise InputError(f"{path}: {width} × {height} is not a latitude-longitude image, twice as wide as high")
 
     image, _ = read_exr(path, check_size)
-    return np.maximum(image, 0.0)
+    if image.max() > _MAXIMUM_RADIANCE:
+        raise InputError(f"{path}: holds radiance of {image.max():.0e}, more than {_MAXIMUM_RADIANCE:.0e}")
+    light = np.maximum(image, 0.0)
+    if (light - image).sum(dtype=np.float64) > _NEGATIVE_SHARE * light.sum(dtype=np.float64):
+        raise InputError(f"{path}: holds negative radiance; export it again")
+    return light

@@ -54,6 +54,13 @@ def evaluate_lobes(lobes: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.exp(lobes[:, 3] * (cosine - 1.0)) @ lobes[:, 4:]
 
 
+def scale_lobes(lobes: np.ndarray, factor: float) -> np.ndarray:
+    """Lobes `[N_l, 7]` that are `factor` times as bright, in the precision of their own."""
+    scaled = lobes.copy()
+    scaled[:, 4:] *= factor
+    return scaled
+
+
 def lobe_integral(sharpness: np.ndarray) -> np.ndarray:
     """∫ exp(λ(ω·ξ − 1)) dω over the sphere, steradians; NumPy, for sharpness > 0."""
     return -2.0 * np.pi * np.expm1(-2.0 * sharpness) / sharpness
