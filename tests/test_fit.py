@@ -16,7 +16,7 @@ from conftest import tiny_fit
 from PIL import Image
 
 from sira_mi.avatar.file import PRIOR, load_avatar
-from sira_mi.colour import linear_to_srgb
+from sira_mi.colour import linear_to_srgb, srgb_to_linear
 from sira_mi.errors import InputError
 from sira_mi.files import write_exr
 from sira_mi.fit import settings as fit_settings
@@ -27,7 +27,6 @@ from sira_mi.fit.rays import find_modelled_pixels, pixel_rays
 from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
-from sira_mi.portrait.load import srgb_to_linear
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import psnr
 
