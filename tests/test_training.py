@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import signal
 import sys
 
 import mitsuba as mi
@@ -252,6 +253,22 @@ def test_the_best_loss_survives_a_resume(tmp_path):
     run_training(tmp_path, "x", 120, *plain())
     with pytest.raises(InputError, match=r"diverges at step 219, its loss is 10\.0 times its best"):
         run_training(tmp_path, "x", 400, *plain(lambda step: {"a": 10.0}))
+
+
+def test_an_interrupted_training_resumes_to_the_same_result(tmp_path):
+    """Ctrl-C is answered after the step, with a checkpoint."""
+    ends = run_training(tmp_path, "whole", 30, *plain())
+    optimizer, rates, step = plain()
+
+    def interrupt(number):
+        if number == 12:
+            signal.raise_signal(signal.SIGINT)
+        return step(number)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(tmp_path, "x", 30, optimizer, rates, interrupt)
+    assert stored_step(tmp_path) == 13
+    assert np.array_equal(run_training(tmp_path, "x", 30, *plain())["x"], ends["x"])
 
 
 def test_a_resumed_log_has_every_line_once(tmp_path, monkeypatch):

@@ -33,21 +33,23 @@ def main() -> None:
     if (arguments.steps is not None and arguments.steps < 1) or arguments.picture_steps < 1:
         raise InputError("--steps and --picture-steps are at least 1")
 
+    from sira_mi.files import hold_folder
     from sira_mi.variants import set_variant
 
     set_variant(arguments.variant)
     from sira_mi.training.train import parse_sizes, train_appearance, train_shape
 
     train = train_shape if arguments.model == "shape" else train_appearance
-    train(
-        arguments.collection,
-        arguments.out,
-        steps=arguments.steps,
-        seed=arguments.seed,
-        without=arguments.without,
-        sizes=parse_sizes(arguments.architecture),
-        picture_steps=arguments.picture_steps,
-    )
+    with hold_folder(arguments.out):
+        train(
+            arguments.collection,
+            arguments.out,
+            steps=arguments.steps,
+            seed=arguments.seed,
+            without=arguments.without,
+            sizes=parse_sizes(arguments.architecture),
+            picture_steps=arguments.picture_steps,
+        )
 
 
 if __name__ == "__main__":

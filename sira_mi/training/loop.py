@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sira_mi.errors import InputError
+from sira_mi.interrupts import check_interrupt, postpone_interrupts, was_interrupted
 from sira_mi.optimisation.adam import (
     optimizer_state,
     parameter_values,
@@ -77,9 +78,10 @@ def run_training(
     """Runs `step_function(step)`, which takes a step and returns the unweighted loss terms, `steps` times, or on from
     the checkpoint `folder/name.checkpoint`. Returns the parameters.
 
-    It writes to `folder`: the checkpoint every half minute, unless the loss has risen; a line of `name.log` every
-    hundred steps, with mean terms and seconds; `pictures/name_STEP.png`, by `picture(path, parameters)`, every
-    `picture_steps` steps and at the end, unless pictures have taken 2% of the time already.
+    It writes to `folder`: the checkpoint every half minute and on Ctrl-C, unless the loss has risen; a line of
+    `name.log` every hundred steps, with mean terms and seconds; `pictures/name_STEP.png`, by
+    `picture(path, parameters)`, every `picture_steps` steps and at the end, unless pictures have taken 2% of the time
+    already.
 
     `weights` are the λ of the terms, 1 where missing. `description`, whose values are JSON objects, is stored in the
     checkpoint and has to be the same on a resume. A step depends only on its number and the optimizer's state, so a
@@ -97,39 +99,43 @@ def run_training(
     began = saved = logged = time.monotonic()
     drawing, totals = 0.0, []
     progress = tqdm(range(start, steps), initial=start, total=steps, desc=name, mininterval=5.0)
-    for step in progress:
-        optimizer.set_learning_rate(rates(step))
-        terms = step_function(step)
-        if not all(math.isfinite(v) for v in terms.values()):
-            raise InputError(f"{name}: the loss is not finite at step {step}: {terms}; lower the learning rate")
-        watch.add(sum(weights.get(k, 1.0) * v for k, v in terms.items()))
-        if watch.ratio > _DIVERGED:
-            shown = ", ".join(f"{k} {v:.4g}" for k, v in terms.items())
-            raise InputError(
-                f"{name}: the training diverges at step {step}, its loss is {watch.ratio:.1f} times its best "
-                f"({shown}); lower the learning rate; {checkpoint} is from before that"
-            )
+    with postpone_interrupts():
+        for step in progress:
+            optimizer.set_learning_rate(rates(step))
+            terms = step_function(step)
+            if not all(math.isfinite(v) for v in terms.values()):
+                raise InputError(f"{name}: the loss is not finite at step {step}: {terms}; lower the learning rate")
+            watch.add(sum(weights.get(k, 1.0) * v for k, v in terms.items()))
+            if watch.ratio > _DIVERGED:
+                shown = ", ".join(f"{k} {v:.4g}" for k, v in terms.items())
+                raise InputError(
+                    f"{name}: the training diverges at step {step}, its loss is {watch.ratio:.1f} times its best "
+                    f"({shown}); lower the learning rate; {checkpoint} is from before that"
+                )
 
-        totals.append(terms)
-        done, now = step + 1, time.monotonic()
-        if done % 100 == 0:
-            means = {k: round(float(np.mean([t[k] for t in totals])), 6) for k in terms}
-            with log.open("a") as file:
-                file.write(json.dumps({"step": done, **means, "seconds": round(now - logged, 2)}) + "\n")
-            progress.set_postfix({k: f"{v:.4f}" for k, v in list(means.items())[:3]})
-            totals, logged = [], now
+            totals.append(terms)
+            done, now = step + 1, time.monotonic()
+            if done % 100 == 0:
+                means = {k: round(float(np.mean([t[k] for t in totals])), 6) for k in terms}
+                with log.open("a") as file:
+                    file.write(json.dumps({"step": done, **means, "seconds": round(now - logged, 2)}) + "\n")
+                progress.set_postfix({k: f"{v:.4f}" for k, v in list(means.items())[:3]})
+                totals, logged = [], now
 
-        if done == steps or (now - saved > _CHECKPOINT_SECONDS and watch.sound):
-            metadata = {"step": str(done), "best": repr(watch.best), **description}
-            write_arrays(checkpoint, optimizer_state(optimizer), metadata)
-            saved = now
+            interrupted = was_interrupted()
+            if done == steps or ((interrupted or now - saved > _CHECKPOINT_SECONDS) and watch.sound):
+                metadata = {"step": str(done), "best": repr(watch.best), **description}
+                write_arrays(checkpoint, optimizer_state(optimizer), metadata)
+                saved = now
 
-        due = done == steps or (done % picture_steps == 0 and drawing <= _PICTURE_SHARE * (now - began))
-        if picture is not None and due:
-            (folder / "pictures").mkdir(exist_ok=True)
-            picture(folder / "pictures" / f"{name}_{done:06d}.png", parameter_values(optimizer))
-            drawing += time.monotonic() - now
-            logged += time.monotonic() - now
+            due = done == steps or (done % picture_steps == 0 and drawing <= _PICTURE_SHARE * (now - began))
+            if picture is not None and due:
+                (folder / "pictures").mkdir(exist_ok=True)
+                picture(folder / "pictures" / f"{name}_{done:06d}.png", parameter_values(optimizer))
+                drawing += time.monotonic() - now
+                logged += time.monotonic() - now
+            if interrupted:
+                check_interrupt()
     return parameter_values(optimizer)
 
 

@@ -36,19 +36,22 @@ def main() -> int:
     if arguments.command == "landmarks":
         return print_landmark_errors(arguments.heads, arguments.hair)
 
+    from sira_mi.files import check_own, hold_folder
     from sira_mi.training.collection.build import BuildSettings, build
     from sira_mi.training.collection.makehuman import load_pack
     from sira_mi.training.collection.sheet import write_sheet
 
     if arguments.command == "sheet":
+        check_own([arguments.out])
         write_sheet(arguments.folder, arguments.out, count=arguments.count, views=tuple(arguments.views))
         return 0
     if arguments.seed < 0 or arguments.workers < 1 or arguments.count < 0 or arguments.ict_count < 0:
         raise InputError("--seed, --count and --ict-count must not be negative, --workers must be at least 1")
     load_pack()  # before anything is written, as it may be missing
     settings = BuildSettings(sources_of(arguments), arguments.seed, arguments.hdri, arguments.workers)
-    manifest = build(arguments.out, settings)
-    write_sheet(arguments.out, arguments.out / "contact.png")
+    with hold_folder(arguments.out):
+        manifest = build(arguments.out, settings)
+        write_sheet(arguments.out, arguments.out / "contact.png")
     for entry in manifest["scenes"]:
         if "error" in entry:
             print(f"skipped {entry['file']}: {entry['error']}")
