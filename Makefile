@@ -8,15 +8,20 @@ PHOTO ?=
 
 .PHONY: install fit lint check test
 
-install: $(VENV)/.installed
+# .installed: what a fit needs; .tools: also what tests and checks need.
+install: $(VENV)/.tools
 
 $(VENV)/.installed: pyproject.toml setup.py
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/.tools: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-fit: install
+fit: $(VENV)/.installed
 	$(BIN)/python -m sira_mi.fit $(if $(PHOTO),"$(PHOTO)",--example) --out "$(OUT)" --quality $(QUALITY)
 
 lint: install

@@ -30,6 +30,7 @@ def _describe_missing(variant: str) -> str:
             "path of an LLVM library that is newer or is there"
         )
     return (
-        "Dr.Jit finds no LLVM; install it (Linux: pip install karellen-llvm-core; macOS: brew install llvm; Windows: "
-        "the installer of llvm.org), and if that is not enough set DRJIT_LIBLLVM_PATH to the path of its library"
+        "Dr.Jit finds no LLVM; install it (Linux: pip install karellen-llvm-core, on ARM apt install llvm; macOS: "
+        "brew install llvm; Windows: the installer of llvm.org), and if that is not enough set "
+        "DRJIT_LIBLLVM_PATH to the path of its library"
     )
