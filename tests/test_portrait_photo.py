@@ -259,6 +259,23 @@ def test_exr_that_cannot_be_taken_as_it_says_is_refused(tmp_path):
         one_line(error, str(path))
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif", "ppm", "jp2"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_all_bits_are_kept(tmp_path, suffix, dtype):
+    """Without EXIF data too, which Pillow decodes a PNG to look for."""
+    import OpenImageIO as oiio
+
+    rng = np.random.default_rng(8)
+    for channels in (1, 3):
+        pixels = rng.integers(0, np.iinfo(dtype).max, (40, 50, channels)).astype(dtype)
+        path = tmp_path / f"photo.{suffix}"
+        output = oiio.ImageOutput.create(str(path))
+        output.open(str(path), oiio.ImageSpec(50, 40, channels, oiio.UINT8 if dtype == np.uint8 else oiio.UINT16))
+        assert output.write_image(pixels) and output.close()
+        expected = np.broadcast_to(srgb_to_linear(pixels / np.iinfo(dtype).max), (40, 50, 3))
+        np.testing.assert_allclose(load_photo(path).image, expected, atol=1e-6)
+
+
 def _profile(curve: bytes, name: str = "test", kind: bytes = b"RGB ") -> bytes:
     """An ICC profile of sRGB's primaries with one curve for all channels."""
 

@@ -7,7 +7,9 @@ from sira_mi.errors import CommandParser, InputError, run_command
 
 def main() -> int:
     parser = CommandParser(prog="python -m sira_mi.fit", description="Fits an avatar to one portrait photo.")
-    parser.add_argument("photo", nargs="?", type=Path, help="portrait photo: JPEG, PNG, TIFF, ... or linear EXR")
+    parser.add_argument(
+        "photo", nargs="?", type=Path, help="portrait photo: JPEG, PNG, TIFF, WebP, HEIC, AVIF, ... or linear EXR"
+    )
     parser.add_argument("--example", action="store_true", help="fit the public-domain portrait of scikit-image instead")
     parser.add_argument("--out", type=Path, default=Path("avatar"), help="folder for the avatar (default: avatar)")
     parser.add_argument("--quality", choices=("draft", "standard", "high"), default="standard")

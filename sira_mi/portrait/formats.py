@@ -19,7 +19,24 @@ Strips = Callable[[int, int, int, int], tuple[np.ndarray, np.ndarray | None]]  #
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 TIFF_WIDTH, TIFF_HEIGHT = 256, 257
 
-_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBX", "RGBA", "RGBa", "CMYK", "YCbCr", "I;16", "I;16B", "I;16L")
+_MODES = (
+    "1",
+    "L",
+    "LA",
+    "La",
+    "P",
+    "PA",
+    "RGB",
+    "RGBX",
+    "RGBA",
+    "RGBa",
+    "CMYK",
+    "YCbCr",
+    "I;16",
+    "I;16B",
+    "I;16L",
+    "I",
+)
 _SUBFILE_TYPE, _BITS, _PHOTOMETRIC, _PLANAR, _WHITE_IS_ZERO = 254, 258, 262, 284, 0
 _ORIENTATION, _EXIF_IFD, _FOCAL_35MM, _EXIF_WIDTH, _EXIF_HEIGHT = 0x0112, 0x8769, 0xA405, 0xA002, 0xA003
 _SAME_ASPECT = 0.02  # of the longer side over the shorter: rounding while a photo is scaled
@@ -101,16 +118,23 @@ def _count_pictures(path: Path, picture: Any) -> int:
         return 1
 
 
-def is_deep(picture: Any) -> bool:
-    """Whether the samples have more than 8 bits, of which Pillow keeps 8."""
+def is_deep(path: Path, picture: Any) -> bool:
+    """Whether the samples have more than 8 bits, of which Pillow keeps 8; asked before the picture is decoded."""
     if picture.format == "TIFF":
         return max(picture.tag_v2.get(_BITS, (1,))) > 8
+    if picture.format in ("PPM", "JPEG2000"):
+        import OpenImageIO as oiio  # deferred: few photos need it
+
+        file = oiio.ImageInput.open(str(path))
+        if file is None:
+            oiio.geterror()  # otherwise printed when the program ends
+        return file is not None and str(file.spec().format) != "uint8"
     return picture.format == "PNG" and ";16" in str(picture.tile)
 
 
 def check_mode(path: Path, picture: Any, deep: bool) -> None:
     """Raises `InputError` for pixels that cannot be read as what they are."""
-    if picture.mode in ("I", "F"):
+    if picture.mode == "F" or (picture.mode == "I" and not (picture.format == "PPM" and deep)):
         raise InputError(f"{path} has 32-bit pixels: save it as 8- or 16-bit PNG, or as EXR")
     tags = getattr(picture, "tag_v2", {})
     is_separate_cmyk = deep and picture.mode == "CMYK" and tags.get(_PLANAR) == 2

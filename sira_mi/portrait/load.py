@@ -115,7 +115,7 @@ def _reduction(width: int, height: int, max_pixels: int) -> int:
 
 
 def _decode(path: Path, picture: Any, max_pixels: int, encoding: Encoding | None, notes: list[str]) -> Photo:
-    deep = is_deep(picture)
+    deep = is_deep(path, picture)
     tags = getattr(picture, "tag_v2", {})
     stored = (int(tags.get(TIFF_WIDTH, picture.size[0])), int(tags.get(TIFF_HEIGHT, picture.size[1])))
     _check_size(path, *stored)
