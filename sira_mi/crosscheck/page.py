@@ -1,6 +1,7 @@
 """Figures, picture and page of one avatar's cross-check."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,7 @@ def cross_check(
     # Path tracing as two halves of other random numbers: the product of their differences has no noise in its mean.
     settings = RelightSettings(samples=samples // 2, seed=seed)
     other = replace(settings, seed=seed + 1)
+    print("baking the head", file=sys.stderr)
     shape = load_head(subject, settings)
     with tqdm(total=2 * settings.samples + CLOSED_FORM_SAMPLES, unit="spp", disable=None) as bar:
         result = compare(shape, subject.camera, light, yaw_degrees, settings, bar.update)

@@ -107,6 +107,7 @@ def run_stages(
     bar = tqdm(total=total, initial=done + progress.step, desc="fit", unit="step", mininterval=1, smoothing=0.05)
     with postpone_interrupts(), bar:
         for stage in stages[progress.stage :]:
+            bar.set_postfix_str(f"{stage.name}: starting, compiling")
             _run_stage(run, stage, make_problem(stage, progress.state), bar, done)
             done += stage.steps
             progress.finish_stage()

@@ -116,10 +116,12 @@ def _fit_in_folder(request: FitRequest, work: Path, started: float) -> bool:
         "versions": {"sira_mi": sira_mi.__version__, **{p: version(p) for p in ("mitsuba", "drjit", "numpy")}},
     }
     if request.explain and complete:
+        print("measuring what the stages leave out", file=sys.stderr)
         task.plan = measure_fit(task, progress.state)
         print(explain(task.plan), file=sys.stderr)
     report["plan"] = task.plan.report()
     if request.polish and complete:
+        print("measuring the polish by path tracing", file=sys.stderr)
         report["polish"] = measure_polish(task, polish_stage(), progress.state)
     write_folder(request.out, task.pose_portrait(progress.state), avatar, task.settings, report, started)
     if complete:
@@ -160,6 +162,7 @@ def prepare_fit(request: FitRequest, work: Path) -> FitTask:
         settings = replace(settings, stages=(*settings.stages, polish_stage()))
     prior_path = request.prior or PRIOR
     prior = load_prior(prior_path)
+    print("finding the face, its mask and the camera", file=sys.stderr)
     portrait = read_portrait(request, settings, prior)
     for note in portrait.notes:
         print(f"note: {note}", file=sys.stderr)
@@ -252,6 +255,7 @@ def write_folder(
     """Completes the report and writes everything that a fit leaves behind beside the avatar file. The camera of
     `portrait` sees the head unmoved."""
     begun = time.monotonic()
+    print("rendering and writing the folder", file=sys.stderr)
     avatar_path = out / "avatar.safetensors"
     lobes = avatar.tensors["lobes"]
     write_lights(out / "lights.json", lobes)

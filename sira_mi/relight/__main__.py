@@ -175,9 +175,11 @@ def _plan_pictures(
     everything = replace(settings, exact=settings.integrator == "path")
     if options.keep_all and not options.explain:
         return everything, load_head(subject, everything)
+    print("baking the head and looking for what it can leave out", file=sys.stderr)
     shape = load_head(subject, settings)
     plan = plan_relight(subject, light, shape, everything, yaws, exact=settings.exact)
     if options.explain:
+        print("measuring what is left out", file=sys.stderr)
         print(explain(measure_plan(plan, subject, light, everything, yaws[0])), flush=True)
     chosen = (plan.keep_all() if options.keep_all else plan).apply(everything)
     if (chosen.exact, chosen.specular) != (settings.exact, settings.specular):
@@ -225,9 +227,13 @@ def main(arguments: list[str] | None = None) -> int:
     subject = read_subject(options.avatar, options.size)
     if options.view == "head" or not (options.view or options.compare):
         subject = subject.frame_head()
-    light = read_light(options.lights, subject.avatar, lobes=options.compare or options.integrator == "sg")
+    lobes = options.compare or options.integrator == "sg"
+    if options.lights and lobes and options.lights.suffix.lower() == ".exr":
+        print(f"fitting spherical Gaussians to {options.lights}", file=sys.stderr)
+    light = read_light(options.lights, subject.avatar, lobes=lobes)
 
     if options.compare:
+        print("baking the head", file=sys.stderr)
         shape = load_head(subject, replace(settings, integrator="path"))
         with tqdm(total=settings.samples + CLOSED_FORM_SAMPLES, unit="spp", disable=None) as bar:
             result = compare(shape, subject.camera, light, options.yaw, settings, bar.update)
@@ -246,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
     yaws = [options.yaw + 360 * frame / len(stems) for frame in range(len(stems))]
     settings, shape = _plan_pictures(subject, light, settings, yaws, options)
     exposures = []
-    with tqdm(total=len(stems) * settings.samples, unit="spp", disable=None) as bar:
+    with tqdm(total=len(stems) * settings.samples, desc="rendering", unit="spp", disable=None) as bar:
         for frame, yaw in zip(stems, yaws, strict=True):
             scene = load_scene(shape, subject.camera, light, yaw, settings)
             radiance = render_passes(scene, settings, bar.update)[..., :3]
