@@ -1,5 +1,6 @@
 """Starting up: `--help` is quick, plugins load only what they use, and are registered in any order of imports."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +93,24 @@ for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     assert result.returncode == 0, result.stderr[-2000:]
     lines = [line for line in result.stdout.splitlines() if line.startswith("llvm")]
     assert lines == ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path, code", [("", 0), ("/missing/libLLVM.so", 2), (__file__, 2)])
+def test_an_llvm_that_cannot_be_used_is_one_line(path, code):
+    """An empty DRJIT_LIBLLVM_PATH is as none; one that names no library is said."""
+    command = """
+from sira_mi.errors import run_command
+def main():
+    from sira_mi.variants import set_variant
+    set_variant("llvm_ad_rgb")
+run_command(main)
+"""
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}
+    result = subprocess.run(
+        [sys.executable, "-c", command], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == code, result.stderr
+    if code:
+        assert result.stderr.splitlines()[-1].startswith("error: Dr.Jit cannot use the LLVM")
+        assert path in result.stderr and "Traceback" not in result.stderr
