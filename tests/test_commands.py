@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sira_mi.crosscheck.__main__ import main as cross_check
 from sira_mi.errors import InputError
 from sira_mi.files import check_outputs, check_own, hold_folder, write_exr, write_png, write_through
 from sira_mi.fit.fit import FitRequest, check_folder, describe_start
@@ -41,6 +42,13 @@ def test_relighting_never_overwrites_its_light(name, out, more, avatar_path, tmp
     for light in (tmp_path / name, tmp_path / ".." / tmp_path.name / name, tmp_path / "link.exr"):
         with pytest.raises(InputError, match="is an input"):
             relight(avatar_path, "--lights", light, "--out", tmp_path / out, *more)
+
+
+def test_a_cross_check_never_overwrites_its_light(tmp_path, avatar_path):
+    light = tmp_path / "crosscheck.json"
+    light.write_text("{}")
+    with pytest.raises(InputError, match="is an input"):
+        cross_check([avatar_path, "--lights", str(light), "--out", str(tmp_path)])
 
 
 def test_relighting_replaces_its_own_pictures_alone(avatar_path, tmp_path):

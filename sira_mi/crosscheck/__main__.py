@@ -47,6 +47,10 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     _check(options)
 
+    from sira_mi.files import check_outputs
+
+    check_outputs([options.out / f"crosscheck.{kind}" for kind in ("json", "md", "png")], (options.lights,))
+
     from sira_mi.crosscheck.page import cross_check, write_page
     from sira_mi.relight.subject import read_light, read_subject
     from sira_mi.variants import set_variant
