@@ -56,10 +56,9 @@ def to_markdown(name: str, kind: str, docstring: str) -> str:
 def pages() -> dict[Path, str]:
     """All pages by path."""
     result = {}
-    for path in sorted((ROOT / "plugins").glob("*.py")):
-        if path.stem != "__init__":
-            kind, docstring = plugin_docstring(path.read_text(encoding="utf-8"))
-            result[ROOT / "docs" / "plugins" / f"{path.stem}.md"] = to_markdown(path.stem, kind, docstring)
+    for path in sorted((ROOT / "plugins").glob("[!_]*.py")):
+        kind, docstring = plugin_docstring(path.read_text(encoding="utf-8"))
+        result[ROOT / "docs" / "plugins" / f"{path.stem}.md"] = to_markdown(path.stem, kind, docstring)
     return result
 
 

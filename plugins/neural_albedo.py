@@ -1,4 +1,6 @@
+import weakref
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -18,6 +20,12 @@ from sira_mi.avatar.shape import HeadShape
 from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers, pack
 from sira_mi.fields.sdf import deform_cooperative
+from sira_mi.plugins._parameters import check_networks, read_flag
+
+
+def is_instanced(si):
+    """Whether surface interactions are with an `instance` of a shape."""
+    return dr.reinterpret_array(mi.UInt32, si.instance) != 0
 
 
 def find_avatar(props, name: str = "avatar") -> str:
@@ -26,6 +34,14 @@ def find_avatar(props, name: str = "avatar") -> str:
     path = props.get(name, "")
     resolver: Any = mi.file_resolver  # a function, which the stubs call an object
     return str(resolver().resolve(path)) if path else ""
+
+
+@dataclass
+class FieldMesh:
+    """A head's mesh in its field's coordinates."""
+
+    vertices: Any = None  # [3, V]
+    faces: Any = None  # indices of vertices, three a triangle
 
 
 class NeuralAlbedo(mi.Texture):
@@ -66,7 +82,9 @@ class NeuralAlbedo(mi.Texture):
 
     A neural field over SIRA's reference space: the deformation network maps a surface point to x_ref and features γ,
     from which the albedo network predicts the albedo. Inside the BSDF of a `neural_sdf`, deformation, shape latent and
-    transform are that shape's, and gradients flow to them; elsewhere they are the avatar's.
+    transform are that shape's, and gradients flow to them; elsewhere they are the avatar's. A texture belongs to one
+    shape. Two heads need two materials, and `optimize=False` where these are alike, for Mitsuba makes one of them
+    otherwise. Instances of its shape show the shape's albedo, without gradients to the shape.
 
     Works in any stock BSDF and inside symbolic loops, where networks are evaluated as cooperative vectors. Call
     `params.update()` after enabling gradients. If one channel is asked of a three-channel texture, it returns the
@@ -94,9 +112,10 @@ class NeuralAlbedo(mi.Texture):
         if mi.is_spectral or mi.is_polarized:
             raise InputError("neural_albedo works in RGB and monochrome variants, such as llvm_ad_rgb")
         avatar = load_avatar(find_avatar(props))
-        self.baked = bool(props.get("baked", False))
+        self.baked = read_flag(props, "neural_albedo", "baked", False)
         self.changed = False  # since a baked texture was last baked
         self._attribute = None
+        self._owner: Any = None  # a weak reference to the shape whose reference space it has
         self.kind = props.get("kind", "diffuse")
         if self.kind not in ("diffuse", "specular"):
             raise ValueError(f"neural_albedo: kind is '{self.kind}', must be 'diffuse' or 'specular'")
@@ -105,13 +124,24 @@ class NeuralAlbedo(mi.Texture):
         self.latent = mi.Float(tensors["z_a" if self.kind == "diffuse" else "z_s"])
         self.refinement = mi.Float(tensors["albedo_refinement"])
         self.k_r = mi.Float(avatar.k_r)
+        self._sizes = {name: len(value) for name, value in self._parameters().items()}
         self.architecture = avatar.architecture
         self._pack()
-        self.bind(HeadShape(avatar.architecture), tensors, mi.Transform4f())
+        self.bind(HeadShape(avatar.architecture), tensors, mi.Transform4f(), None)
 
-    def bind(self, shape: HeadShape, parameters: Mapping, to_local) -> None:
-        """Takes the reference space from a head: its shape, the parameters of that, and the transform from world to
-        the field's coordinates."""
+    def own(self, owner) -> None:
+        """Makes it part of a `neural_sdf`. Raises InputError if it is part of another."""
+        if self._owner is not None and self._owner() is not None:
+            raise InputError(
+                "neural_albedo: two heads share one texture; give each a material of its own, and load with "
+                "optimize=False where they are alike"
+            )
+        self._owner = weakref.ref(owner)
+
+    def bind(self, shape: HeadShape, parameters: Mapping, to_local, mesh: FieldMesh | None) -> None:
+        """Takes the reference space from a head: its shape, the parameters of that, the transform from world to the
+        field's coordinates, and the mesh."""
+        self._mesh = mesh
         self._deformation = pack(shape.deformation(parameters))
         self._to_local = to_local
         self._space = (parameters, to_local)
@@ -157,7 +187,23 @@ class NeuralAlbedo(mi.Texture):
 
     def _place(self, si) -> tuple[list, list]:
         """x_ref and γ of a surface interaction."""
-        return deform_cooperative(self._deformation, self.architecture.sdf_octaves, list(self._to_local @ si.p))
+        point = self._to_local @ si.p
+        if self._mesh is not None:
+            instanced = is_instanced(si)
+            point = dr.select(instanced, self._on_mesh(self._mesh, si, instanced), point)
+        return deform_cooperative(self._deformation, self.architecture.sdf_octaves, list(point))
+
+    @staticmethod
+    def _on_mesh(mesh: FieldMesh, si, active):
+        """The point of the mesh in the field's coordinates. An instance moves the interaction and not the mesh."""
+        vertices, faces = mesh.vertices, mesh.faces
+        weights = (1.0 - si.uv.x - si.uv.y, si.uv.x, si.uv.y)
+        point = mi.Point3f(0.0)
+        for corner, weight in enumerate(weights):
+            index = dr.gather(mi.UInt32, faces, 3 * si.prim_index + corner, active)
+            place = [dr.gather(mi.Float, vertices.array, k * vertices.shape[1] + index, active) for k in range(3)]
+            point += weight * mi.Point3f(*place)
+        return point
 
     def _network_albedo(self, x_ref: list, gamma: list) -> list:
         a = self.architecture
@@ -174,6 +220,10 @@ class NeuralAlbedo(mi.Texture):
             raise RuntimeError("neural_albedo: a baked texture works inside a neural_sdf only; leave baked out")
         if any(self._gradients()):
             raise RuntimeError("neural_albedo: a baked texture has no gradients; leave baked out to differentiate it")
+        if self._mesh is not None:  # attributes are looked up at the point where the mesh itself lies
+            si = mi.SurfaceInteraction3f(si)
+            instanced = is_instanced(si)
+            si.p = dr.select(instanced, self._to_local.inverse() @ self._on_mesh(self._mesh, si, instanced), si.p)
         if self.kind == "specular":
             return [si.shape.eval_attribute_1(self._attribute, si)]
         return list(si.shape.eval_attribute_3(self._attribute, si))
@@ -220,14 +270,16 @@ class NeuralAlbedo(mi.Texture):
     def is_spatially_varying(self):
         return True
 
+    def _parameters(self) -> dict:
+        names = ("weights", "latent", *(("refinement", "k_r") if self.kind == "diffuse" else ()))
+        return {name: getattr(self, name) for name in names}
+
     def traverse(self, callback):
-        callback.put("weights", self.weights, mi.ParamFlags.Differentiable)
-        callback.put("latent", self.latent, mi.ParamFlags.Differentiable)
-        if self.kind == "diffuse":
-            callback.put("refinement", self.refinement, mi.ParamFlags.Differentiable)
-            callback.put("k_r", self.k_r, mi.ParamFlags.Differentiable)
+        for name, value in self._parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
+        check_networks("neural_albedo", self._parameters(), self._sizes)
         self._pack()
         self.changed = True
 

@@ -10,7 +10,17 @@ from sira_mi.fields import tracing
 from sira_mi.fields.columns import CHUNK, evaluate_in_chunks, gather_columns, scatter_columns, to_array
 from sira_mi.fields.extraction import extract
 from sira_mi.fields.sdf import SdfField, deform, signed_distance, surface
-from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
+from sira_mi.plugins._parameters import (
+    check_networks,
+    read_flag,
+    read_integer,
+    read_number,
+    read_similarity,
+)
+from sira_mi.plugins.neural_albedo import FieldMesh, NeuralAlbedo, find_avatar
+
+# An attribute without a meaning of its own: Mitsuba's `merge` leaves meshes with attributes as they are.
+UNMERGED = "vertex_unmerged"
 
 
 class NeuralSDF(mi.Mesh):
@@ -67,8 +77,9 @@ class NeuralSDF(mi.Mesh):
 
     Change the geometry through the *scene's* parameters (`mi.traverse(scene)`), and call `params.update()` after
     enabling gradients. The shape has no UVs and should not be used as an area light. Where it meets the domain box it
-    is closed by a flat cap without gradients. On loading, Mitsuba merges meshes with equal BSDFs, which would hide a
-    head's parameters: give it a BSDF of its own, or load with `optimize=False`.
+    is closed by a flat cap without gradients. An update refuses the values that loading refuses. When Mitsuba loads a
+    scene, it merges meshes with equal BSDFs unless they have attributes; the empty attribute `vertex_unmerged` keeps a
+    head apart.
 
     Source: SIRA (Caselles et al. 2022), section 3.1.1; implicit differentiation as in IDR (Yariv et al. 2020).
 
@@ -83,29 +94,26 @@ class NeuralSDF(mi.Mesh):
     def __init__(self, props):
         self.avatar_path = find_avatar(props)
         avatar = load_avatar(self.avatar_path)
-        self.voxel = float(props.get("voxel", 0.05))
-        self.remesh_every = int(props.get("remesh_every", 1))
-        if not 0.005 <= self.voxel <= 0.5:
-            raise ValueError(f"neural_sdf: voxel is {self.voxel}, must lie in [0.005, 0.5] scene units")
-        if self.remesh_every < 1:
-            raise ValueError(f"neural_sdf: remesh_every is {self.remesh_every}, must be at least 1")
-        matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
-        scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-        if not (scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < 1e-3):
-            raise ValueError("neural_sdf: to_world may rotate, translate and scale uniformly; it does more")
+        self.voxel = read_number(props, "neural_sdf", "voxel", 0.05, 0.005, 0.5)
+        self.remesh_every = read_integer(props, "neural_sdf", "remesh_every", 1, 1, 1 << 30)
+        matrix, self.scale = read_similarity(props, "neural_sdf")
         super().__init__(props.id() or "neural_sdf", 1, 1, props=props, has_vertex_normals=True)
         self.to_world = mi.Transform4f(cast(Any, matrix))  # the stubs leave out float64
         self.to_local = self.to_world.inverse()
         self._matrix_to_local = np.linalg.inv(matrix)
         self.head_shape = HeadShape(avatar.architecture)
         self.parameters = {name: mi.Float(avatar.tensors[name]) for name in SHAPE_PARAMETERS}
-        if props.get("movable", False):
+        if read_flag(props, "neural_sdf", "movable", False):
             self.parameters[POSE] = mi.Float(np.zeros(6, np.float32))
+        self._sizes = {name: len(value) for name, value in self.parameters.items()}
         self._updates = 0
         self._last_hits = None
         self._textures = [node for node in mi.traverse(self.bsdf()).hierarchy if isinstance(node, NeuralAlbedo)]
         if self._textures and POSE in self.parameters:
             raise ValueError("neural_sdf: a movable head cannot carry a neural_albedo, which does not move with it")
+        self._mesh = FieldMesh()
+        for texture in self._textures:
+            texture.own(self)
         self._bind_textures()
         self._extract()
         self._add_attributes()
@@ -127,6 +135,13 @@ class NeuralSDF(mi.Mesh):
         """Makes the next update of the parameters extract the mesh, and starts the count of `remesh_every` there."""
         self._updates = self.remesh_every - 1
 
+    def ray_to_local(self, ray):
+        """A ray of the world in the field's coordinates, its direction as long as in the world: a distance t along the
+        one is t divided by `scale` along the other."""
+        local = self.to_local @ ray
+        local.d = local.d * self.scale
+        return local
+
     def refine(self, ray, t, active):
         """Exact hits of `ray` (Ray3f) near the proxy hits at t (Float), for the `active` lanes: (t of the exact hit,
         whether there is one). The field is evaluated outside of symbolic code."""
@@ -141,11 +156,11 @@ class NeuralSDF(mi.Mesh):
         # From the proxy's hit on: single precision does not resolve 0.01 mm at a camera's distance.
         matrix = self._matrix_to_local
         base = matrix[:3, :3] @ (origin + start * direction) + matrix[:3, 3:]
-        columns = [a.astype(np.float32) for a in (base, matrix[:3, :3] @ direction, 0 * start)]
+        columns = [a.astype(np.float32) for a in (base, matrix[:3, :3] @ direction * self.scale, 0 * start)]
         step, f = self._newton(columns)
         hit = dr.zeros(mi.Bool, width)
         dr.scatter(hit, mi.Bool(np.abs(f[0]) < tracing.HIT_TOLERANCE), index)
-        exact = (start + step).astype(np.float32)
+        exact = (start + step * self.scale).astype(np.float32)
         return scatter_columns(mi.TensorXf(exact), index, width, mi.Float), hit
 
     def _newton(self, columns: list[np.ndarray]) -> list[np.ndarray]:
@@ -181,6 +196,7 @@ class NeuralSDF(mi.Mesh):
         lengths = np.linalg.norm(gradient[:, moved], axis=0)
         self._gradient_length = max(float(np.median(lengths)), 1e-3) if moved.any() else 1.0
         self._faces = mi.UInt32(extracted.faces.ravel())
+        self._mesh.vertices, self._mesh.faces = self._x0, self._faces
 
     def _attach(self) -> None:
         """Sets the mesh to the extracted vertices, attached to those parameters that have gradients enabled."""
@@ -193,16 +209,18 @@ class NeuralSDF(mi.Mesh):
         params = mi.traverse(self)
         params["vertex_positions"] = dr.ravel(position)
         params["faces"] = self._faces
+        params[UNMERGED] = dr.zeros(mi.Float, x.shape[1])
         for name, albedo in self._bake().items():
             params[name] = albedo
         params.update()
 
     def _bind_textures(self) -> None:
         for texture in self._textures:
-            texture.bind(self.head_shape, self.parameters, self.to_local)
+            texture.bind(self.head_shape, self.parameters, self.to_local, self._mesh)
 
     def _add_attributes(self) -> None:
         """Makes an empty vertex attribute for every baked texture, and tells the textures their names."""
+        self.add_attribute(UNMERGED, 1, [0.0] * self.vertex_count())
         self._baked: dict[str, NeuralAlbedo] = {}
         for texture in self._textures:
             if texture.baked:
@@ -236,6 +254,7 @@ class NeuralSDF(mi.Mesh):
             if any(texture.changed for texture in self._baked.values()):
                 self._renew_attributes()
             return
+        check_networks("neural_sdf", self.parameters, self._sizes)
         self._bind_textures()
         self._updates += 1
         if self._updates % self.remesh_every == 0:

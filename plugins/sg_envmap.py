@@ -1,7 +1,7 @@
 """The emitter `sg_envmap`: an environment of spherical Gaussians."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -11,9 +11,10 @@ from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import load_avatar
 from sira_mi.errors import InputError
 from sira_mi.fields.mlp import layers
+from sira_mi.plugins._parameters import can_evaluate, check_numbers, read_integer, read_number, read_similarity
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.sg.fit_environment import EnvironmentFit, fit_environment
-from sira_mi.sg.lights_io import check_lobes, read_environment, read_lights
+from sira_mi.sg.lights_io import MAXIMUM_LOBES, check_lobes, read_environment, read_lights
 from sira_mi.sg.sampling import LobeMixture
 
 # Distance of the environment in scene units; a Python emitter is not told the size of its scene.
@@ -71,12 +72,12 @@ class SGEnvmap(mi.Emitter):
 
      * - scale
        - |float|
-       - Factor of the radiance. (Default: 1)
+       - Factor of the radiance, not negative. (Default: 1)
        - |exposed|, |differentiable|
 
      * - to_world
        - |transform|
-       - Rotation of the environment. (Default: none)
+       - Rotation of the environment; translation and uniform scale have no effect. (Default: none)
 
     The radiance from direction d is l(d) = Σ μ exp(λ(d·ξ − 1)), oriented like Mitsuba's `envmap`. To sample it, a lobe
     is chosen in proportion to the luminance of its energy, then a direction from the lobe's von Mises-Fisher density.
@@ -87,7 +88,7 @@ class SGEnvmap(mi.Emitter):
     scaled to unit length when the plugin is loaded; derivatives by `lobes` are those at the scaled axes. They flow
     through the radiance, not through the sampling, and have no bias; where few samples meet a sharp lobe, those of one
     rendering may be off by a third. Inside Mitsuba's symbolic loops, gradients of `lobes` are summed by atomics, and
-    their last bits vary between runs.
+    their last bits vary between runs. An update refuses the values that loading refuses.
 
     Source: the light model of eq. 8 of SIRA (Caselles et al. 2022), after PhySG (Zhang et al. 2021).
 
@@ -104,8 +105,12 @@ class SGEnvmap(mi.Emitter):
         if mi.is_spectral or mi.is_polarized:
             raise InputError("sg_envmap works in RGB and monochrome variants, such as llvm_ad_rgb")
         self.m_flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.SpatiallyVarying
-        self.scale = mi.Float(props.get("scale", 1.0))
-        count = props.get("lobe_count", 64)
+        self.scale = mi.Float(read_number(props, "sg_envmap", "scale", 1.0, 0.0))
+        count = read_integer(props, "sg_envmap", "lobe_count", 64, 1, MAXIMUM_LOBES)
+        matrix, size = read_similarity(props, "sg_envmap")
+        rotation = np.eye(4)
+        rotation[:3, :3] = matrix[:3, :3] / size
+        self.rotation = mi.Transform4f(cast(Any, rotation))  # the stubs leave out float64
         if "lobes" in props and "filename" in props:
             raise InputError("sg_envmap: give either lobes or filename, not both")
         if "filename" in props:
@@ -114,6 +119,7 @@ class SGEnvmap(mi.Emitter):
             lobes = check_lobes(np.array(props["lobes"]) if "lobes" in props else DEFAULT_LOBES, "sg_envmap")
         self.lobes = mi.TensorXf(lobes)
         self.refinement = read_refinement(find_avatar(props, "light_refinement"))
+        self._check()
         self._prepare()
 
     @staticmethod
@@ -124,10 +130,18 @@ class SGEnvmap(mi.Emitter):
         if suffix == ".json":
             return read_lights(path)
         if suffix == ".exr":
-            if not 1 <= count <= 4096:
-                raise InputError(f"sg_envmap: lobe_count is {count}; it must be 1 to 4096")
             return fit_environment(read_environment(path), EnvironmentFit(lobes=count))
         raise InputError(f"{path}: sg_envmap reads .json and .exr files")
+
+    def _check(self):
+        """Raises InputError for values that are no light."""
+        if not can_evaluate(self.lobes, self.scale):
+            return
+        lobes, scale = dr.detach(self.lobes).numpy(), dr.detach(self.scale).numpy()
+        check_lobes(lobes, "sg_envmap")
+        check_numbers("sg_envmap", "scale", scale, 0.0)
+        if not 4 * np.pi * lobes[:, 4:].sum(axis=0, dtype=np.float64).max() * scale.max() < np.finfo(np.float32).max:
+            raise InputError("sg_envmap: lobes times scale are brighter than single precision holds")
 
     def _prepare(self):
         self.mixture = LobeMixture(self.lobes)
@@ -137,12 +151,13 @@ class SGEnvmap(mi.Emitter):
         callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
+        self._check()
         if not keys or "lobes" in keys:
             self._prepare()
 
     def _evaluate(self, direction):
         """Radiance and sampling density of a world direction."""
-        radiance, pdf = self.mixture.evaluate(self.world_transform().inverse() @ direction)
+        radiance, pdf = self.mixture.evaluate(self.rotation.inverse() @ direction)
         radiance = radiance * self.scale
         return mi.Spectrum(mi.luminance(radiance)) if mi.is_monochromatic else radiance, pdf
 
@@ -150,7 +165,7 @@ class SGEnvmap(mi.Emitter):
         return self._evaluate(-si.wi)[0] & active
 
     def sample_direction(self, it, sample, active=True):
-        direction = dr.normalize(self.world_transform() @ self.mixture.sample(sample, active))
+        direction = dr.normalize(self.rotation @ self.mixture.sample(sample, active))
         ds: Any = dr.zeros(mi.DirectionSample3f)  # the stubs give its fields other types
         ds.p = dr.fma(direction, FAR_DISTANCE, it.p)
         ds.n, ds.d, ds.dist = -direction, direction, mi.Float(FAR_DISTANCE)

@@ -5,9 +5,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from sira_mi.errors import InputError
+from sira_mi.plugins._parameters import can_evaluate, check_numbers, read_number
 from sira_mi.plugins.neural_albedo import NeuralAlbedo
 from sira_mi.sg import brdf
+
+# Smallest and largest values of the numbers that an update may change.
+BOUNDS = {"roughness": (brdf.MINIMUM_ROUGHNESS, brdf.MAXIMUM_ROUGHNESS), "k_s": (0.0, float("inf"))}
 
 
 class SiraBSDF(mi.BSDF):
@@ -61,12 +64,8 @@ class SiraBSDF(mi.BSDF):
         super().__init__(props)
         self.diffuse_albedo = self._texture(props, "diffuse_albedo")
         self.specular_albedo = self._texture(props, "specular_albedo")
-        roughness, k_s = float(props.get("roughness", 0.5)), float(props.get("k_s", 1.0))
-        if not brdf.MINIMUM_ROUGHNESS <= roughness <= brdf.MAXIMUM_ROUGHNESS:
-            raise InputError(f"sira_bsdf: roughness is {roughness}; it must be 0.02 to 1")
-        if not 0.0 <= k_s < float("inf"):
-            raise InputError(f"sira_bsdf: k_s is {k_s}; it must be finite and not negative")
-        self.roughness, self.k_s = mi.Float(roughness), mi.Float(k_s)
+        self.roughness = mi.Float(read_number(props, "sira_bsdf", "roughness", 0.5, *BOUNDS["roughness"]))
+        self.k_s = mi.Float(read_number(props, "sira_bsdf", "k_s", 1.0, *BOUNDS["k_s"]))
         side: Any = mi.BSDFFlags.FrontSide  # flags combine to integers
         if any(texture.is_spatially_varying() for texture in (self.diffuse_albedo, self.specular_albedo)):
             side = side | mi.BSDFFlags.SpatiallyVarying
@@ -85,6 +84,12 @@ class SiraBSDF(mi.BSDF):
         callback.put("specular_albedo", self.specular_albedo, mi.ParamFlags.Differentiable)
         callback.put("roughness", self.roughness, mi.ParamFlags.Differentiable)
         callback.put("k_s", self.k_s, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()):
+        for name, bounds in BOUNDS.items():
+            value = getattr(self, name)
+            if (not keys or name in keys) and can_evaluate(value):
+                check_numbers("sira_bsdf", name, dr.detach(value).numpy(), *bounds)
 
     def _components(self, ctx, active):
         glossy = mi.Bool(ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0))

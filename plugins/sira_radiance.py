@@ -8,6 +8,7 @@ from sira_mi.fields.columns import from_columns, gather_columns, normalise, scat
 from sira_mi.fields.mlp import layers
 from sira_mi.fields.sdf import signed_distance, surface
 from sira_mi.fields.tracing import closest_approach, differentiable_hit, refine_approach
+from sira_mi.plugins._parameters import check_networks, read_number
 from sira_mi.plugins.neural_albedo import find_avatar
 from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 
@@ -67,9 +68,7 @@ class SiraRadiance(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props)
         path = find_avatar(props)
-        self.mask_sharpness = float(props.get("mask_sharpness", 50.0))
-        if not self.mask_sharpness > 0:
-            raise ValueError(f"sira_radiance: mask_sharpness is {self.mask_sharpness}, must be positive")
+        self.mask_sharpness = read_number(props, "sira_radiance", "mask_sharpness", 50.0, 1e-6)
         self.architecture: AvatarArchitecture | None = None
         if path:
             self._load(path)
@@ -79,6 +78,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         self.architecture = avatar.architecture
         self.rendering = mi.Float(avatar.tensors["rendering"])
         self.z_r = mi.Float(avatar.tensors["z_r"])
+        self._sizes = {"rendering": len(self.rendering), "z_r": len(self.z_r)}
         return avatar.architecture
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -87,7 +87,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         architecture = self.architecture or self._load(head.avatar_path)
         ray = mi.Ray3f(dr.detach(ray))
         width = dr.width(ray.o, ray.d)
-        local = head.to_local @ ray
+        local = head.ray_to_local(ray)
         t, hit = trace_head(scene, head, ray, active)
         field = head.field()
 
@@ -99,7 +99,7 @@ class SiraRadiance(mi.SamplingIntegrator):
         color = dr.zeros(mi.Color3f, width)
         index = dr.compress(hit)
         if dr.width(index) > 0:
-            origin, direction, parameter = (gather_columns(a, index) for a in (local.o, local.d, t))
+            origin, direction, parameter = (gather_columns(a, index) for a in (local.o, local.d, t / head.scale))
             x = differentiable_hit(field, origin, direction, parameter)
             _, gradient, x_ref, gamma = surface(field, x)
             network = layers(architecture.networks["rendering"], self.rendering, self.z_r)
@@ -139,7 +139,8 @@ class SiraRadiance(mi.SamplingIntegrator):
             callback.put("z_r", self.z_r, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
-        pass
+        if self.architecture is not None:
+            check_networks("sira_radiance", {"rendering": self.rendering, "z_r": self.z_r}, self._sizes)
 
     def to_string(self):
         return f"SiraRadiance[mask_sharpness = {self.mask_sharpness}]"

@@ -11,6 +11,7 @@ from sira_mi.fields.columns import (
     evaluate_in_chunks,
     from_columns,
     gather_columns,
+    in_three,
     normalise,
     scatter_columns,
     to_array,
@@ -18,8 +19,9 @@ from sira_mi.fields.columns import (
 )
 from sira_mi.fields.sdf import deform, surface
 from sira_mi.fields.tracing import differentiable_hit, on_ray
+from sira_mi.plugins._parameters import read_flag, read_integer
 from sira_mi.plugins.neural_albedo import NeuralAlbedo, find_avatar
-from sira_mi.plugins.neural_sdf import find_head, trace_head
+from sira_mi.plugins.neural_sdf import NeuralSDF, find_head, trace_head
 from sira_mi.plugins.sg_envmap import LightRefinement, SGEnvmap, read_refinement
 from sira_mi.plugins.sira_bsdf import SiraBSDF
 from sira_mi.sg.layers import EXTRA_LAYERS, channel_count, extra_channel_names
@@ -33,6 +35,9 @@ from sira_mi.sg.visibility import (
     light_visibility,
     trace_unoccluded,
 )
+
+# Mitsuba's BSDFs that have a diffuse term alone.
+DIFFUSE_BSDFS = ("SmoothDiffuse", "TwoSidedBRDF")
 
 
 class SiraSG(mi.SamplingIntegrator):
@@ -55,7 +60,7 @@ class SiraSG(mi.SamplingIntegrator):
        - Directions in which visibility is tested, 16 to 4096. (Default: 64)
      * - aovs
        - |bool|
-       - Render the extra channels. (Default: true)
+       - Render the extra channels. Without them a picture can be written as PNG. (Default: false)
      * - exact
        - |bool|
        - Use hits and normals of the field. If false, use those of the mesh, and the albedos of its vertices where a
@@ -78,7 +83,11 @@ class SiraSG(mi.SamplingIntegrator):
     set of directions. Half of them are evenly spread, half follow the lobes. Interreflection is one bounce off
     surfaces that are assumed to face the point and to share its albedo; `path` renders the same scene without these
     approximations. Albedos that are `neural_albedo` textures are evaluated as networks, in tensor mode; other textures
-    are evaluated at the hit. Other shapes only occlude.
+    are evaluated at the hit.
+
+    Shapes beside the head are shaded in the same way; their BSDF must be `diffuse`, a `twosided` one, or `sira_bsdf`.
+    They have no derivatives of their own. Other materials, instances, and lights besides the `sg_envmap` raise
+    RuntimeError, which names them.
 
     The extra channels are `diffuse.RGB` and `specular.RGB` (the two terms of eq. 8, without `light_refinement`),
     `diffuse_albedo.RGB`, `specular_albedo`, `normal.XYZ` (of the field, in world space), `depth` (distance along the
@@ -104,14 +113,12 @@ class SiraSG(mi.SamplingIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.hide_environment = bool(props.get("hide_emitters", False))
-        self.visibility = bool(props.get("visibility", True))
-        self.directions = int(props.get("visibility_directions", DEFAULT_DIRECTIONS))
-        if not 16 <= self.directions <= 4096:
-            raise InputError(f"sira_sg: visibility_directions is {self.directions}; it must be 16 to 4096")
-        self.aovs = bool(props.get("aovs", True))
-        self.exact = bool(props.get("exact", True))
-        self.shared = bool(props.get("shared", False))
+        self.hide_environment = read_flag(props, "sira_sg", "hide_emitters", False)
+        self.visibility = read_flag(props, "sira_sg", "visibility", True)
+        self.directions = read_integer(props, "sira_sg", "visibility_directions", DEFAULT_DIRECTIONS, 16, 4096)
+        self.aovs = read_flag(props, "sira_sg", "aovs", False)
+        self.exact = read_flag(props, "sira_sg", "exact", True)
+        self.shared = read_flag(props, "sira_sg", "shared", False)
         self.refinement = read_refinement(find_avatar(props, "light_refinement"))
         self.shaded_lobes = np.array(props["shaded_lobes"]).astype(int) if "shaded_lobes" in props else None
 
@@ -124,6 +131,7 @@ class SiraSG(mi.SamplingIntegrator):
         if not isinstance(light, SGEnvmap):
             raise RuntimeError("sira_sg: the environment must be an sg_envmap; use path for other lights")
         refinement = self.refinement_of(light)
+        others = other_materials(scene, light)
         ray = mi.Ray3f(ray)
         width = dr.width(ray.o, ray.d)
         attached = dr.grad_enabled(ray.o, ray.d) or has_gradients(head, light)
@@ -135,9 +143,9 @@ class SiraSG(mi.SamplingIntegrator):
 
         # Shading: eq. 8 and the extra channels in tensors, one column a shaded ray.
         index = dr.compress(hits.shaded)
-        columns = None
+        columns, shader = None, HeadShader(self, scene, head, light, attached)
         if dr.width(index) > 0:
-            columns = HeadShader(self, scene, head, light, attached).shade(ray, hits, index)
+            columns = shader.shade(ray, hits, index)
 
         # Scatter: from the columns back to the rays.
         parts, row = {}, 0
@@ -153,14 +161,17 @@ class SiraSG(mi.SamplingIntegrator):
         if refinement is not None:
             radiance *= parts["light_refinement"]
 
-        # Background, and what the film takes.
+        # Other shapes, background, and what the film takes.
         background = dr.zeros(mi.Color3f, width)
         if not self.hide_environment:
             si = dr.zeros(mi.SurfaceInteraction3f, width)
             si.wi = -ray.d
             background = light.eval(si, active & ~hit)
-        color = dr.select(hit, radiance, background)
         valid = active & (hit | (not self.hide_environment))
+        if others:
+            shape, on_shape = shader.shade_others(others, ray, active & ~hit)
+            background, valid = dr.select(on_shape, shape, background), valid | on_shape
+        color = dr.select(hit, radiance, background)
         if not self.aovs:
             return color, valid, []
         parts |= {"depth": dr.select(hit, t, 0.0), "mask": dr.select(hit, mi.Float(1.0), 0.0)}
@@ -196,6 +207,39 @@ class SiraSG(mi.SamplingIntegrator):
 def has_gradients(*objects: mi.Object) -> bool:
     """Whether gradients are enabled for a parameter that one of the objects, or one nested in it, exposes."""
     return any(dr.grad_enabled(value) for one in objects for _, value in mi.traverse(one))
+
+
+def other_materials(scene, light) -> list[mi.BSDF]:
+    """The BSDFs of the shapes beside the head. Raises RuntimeError, with its name, for a shape or a light that
+    closed-form shading does not show."""
+    for emitter in scene.emitters():
+        if emitter is not light:
+            raise RuntimeError(
+                f"sira_sg: it shades by one sg_envmap, not by {_name(emitter)}; use path for other lights"
+            )
+    materials: list[mi.BSDF] = []
+    for shape in scene.shapes():
+        if isinstance(shape, NeuralSDF):
+            continue
+        bsdf = shape.bsdf()
+        nested = [node for node in mi.traverse(bsdf).hierarchy if isinstance(node, mi.BSDF)] if bsdf else []
+        known = all(isinstance(node, SiraBSDF) or node.class_name() in DIFFUSE_BSDFS for node in nested)
+        plain = isinstance(bsdf, SiraBSDF) or not any(isinstance(node, SiraBSDF) for node in nested)
+        if not (nested and known and plain) or shape.is_medium_transition():
+            raise RuntimeError(
+                f"sira_sg: it cannot shade {_name(shape)}; shapes beside the head need a diffuse or sira_bsdf "
+                "material, and may not be instances; use path for others"
+            )
+        if has_gradients(shape):
+            raise RuntimeError(f"sira_sg: no derivatives by {_name(shape)}, which is not the head; use prb")
+        if not any(bsdf is known for known in materials):
+            materials.append(bsdf)
+    return materials
+
+
+def _name(part) -> str:
+    """What a part of a scene is called in a message."""
+    return f"'{part.id()}' ({part.class_name()})"
 
 
 # Hits
@@ -259,12 +303,60 @@ class HeadShader:
         """At the hits of the rays `index`."""
         if hits.on_mesh is not None:
             return self._shade_mesh(ray, hits, index)
-        local = self.head.to_local @ ray
-        origin, direction, t = (gather_columns(v, index) for v in (local.o, local.d, hits.t))
+        local = self.head.ray_to_local(ray)
+        origin, direction, t = (gather_columns(v, index) for v in (local.o, local.d, hits.t / self.head.scale))
         if self.attached:
             return self._shade_field(differentiable_hit(self.field, origin, direction, dr.detach(t)), direction)
         x = on_ray(origin, direction, t)
         return mi.TensorXf(evaluate_in_chunks(self._shade_field, x.numpy(), direction.numpy())[0])
+
+    def shade_others(self, materials: list[mi.BSDF], ray, active) -> tuple[mi.Color3f, mi.Bool]:
+        """Radiance of the shapes beside the head, whose BSDFs are `materials`, and which rays meet one of them first.
+        The shapes are constants."""
+        with dr.suspend_grad():
+            si = self.scene.ray_intersect(dr.detach(ray), active)
+            seen = active & si.is_valid() & (si.shape != mi.ShapePtr(self.head))
+            dr.eval(si, seen)
+        radiance = dr.zeros(mi.Color3f, dr.width(seen))
+        for bsdf in materials:
+            same: mi.Bool = si.bsdf() == mi.BSDFPtr(bsdf)
+            index = dr.compress(seen & same)
+            if dr.width(index) > 0:
+                columns = self._shade_other(bsdf, dr.gather(mi.SurfaceInteraction3f, si, index))
+                radiance += scatter_columns(columns, index, dr.width(seen), mi.Color3f)
+        return radiance, seen
+
+    def _shade_other(self, bsdf, si: mi.SurfaceInteraction3f):
+        """Radiance [3, N] at interactions with shapes of one material."""
+        head, count = self.head, dr.width(si)
+        with dr.suspend_grad():
+            front = mi.Frame3f.cos_theta(si.wi) > 0.0
+            lit = front | mi.Bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide))
+            to_local = to_array(rotation_of(head.to_world).T)
+            normal = to_local @ to_columns(dr.select(front, si.sh_frame.n, -si.sh_frame.n))
+            view = to_local @ to_columns(-si.to_world(si.wi))
+            albedo = mi.Color3f(bsdf.eval_diffuse_reflectance(si)) + dr.zeros(mi.Color3f, count)
+            columns = [to_columns(head.to_local @ si.p), normal, view, to_columns(dr.select(lit, albedo, 0.0))]
+            glossy = isinstance(bsdf, SiraBSDF)
+            if glossy:
+                specular = bsdf.specular_albedo.eval_1(si) + dr.zeros(mi.Float, count)
+                columns.append(to_columns(specular))
+        shine = dr.select(lit, 1.0, 0.0) if glossy else dr.zeros(mi.Float, count)
+
+        def shade(x, normal, view, diffuse, specular=None):
+            material = Material(diffuse, specular, *self._gloss(bsdf if glossy else self.bsdf))
+            return dr.concat([*self._radiance(x, normal, view, material)], axis=0)
+
+        if self.attached:
+            result = shade(*columns)
+        else:
+            result = mi.TensorXf(evaluate_in_chunks(shade, *(c.numpy() for c in columns))[0])
+        return result[0:3, :] + result[3:6, :] * in_three(to_columns(shine))
+
+    @staticmethod
+    def _gloss(bsdf: SiraBSDF) -> tuple:
+        """Roughness and weight of the specular term."""
+        return bsdf.roughness, mi.TensorXf(bsdf.k_s, (1, 1))
 
     def _shade_mesh(self, ray, hits: Hits, index):
         """At the hits on the mesh of the rays `index`, with its normals; without gradients."""
@@ -291,19 +383,23 @@ class HeadShader:
 
     def _shade_points(self, x, direction, normal, diffuse, specular, *factor):
         """Points whose unit normals and albedos are known."""
-        radiance = self._radiance(x, normal, normalise(direction), diffuse, specular)
+        material = Material(diffuse, specular if self.specular_term else None, *self._gloss(self.bsdf))
+        radiance = self._radiance(x, normal, normalise(direction), material)
         extra = (diffuse, specular, self.to_world @ normal) if self.integrator.aovs else ()
         return dr.concat([*radiance, *extra, *factor], axis=0)
 
-    def _radiance(self, x, normal, view, diffuse, specular) -> Radiance:
-        bsdf = self.bsdf
-        specular = specular if self.specular_term else None
-        material = Material(diffuse, specular, bsdf.roughness, mi.TensorXf(bsdf.k_s, (1, 1)))
+    def _radiance(self, x, normal, view, material: Material) -> Radiance:
         visibility = None
         if self.directions is not None:
             unoccluded = unoccluded_directions(self.scene, self.head, x, normal, self.directions)
             visibility = light_visibility(
-                normal, view, specular, bsdf.roughness, self.lobes, self.directions, unoccluded
+                normal,
+                view,
+                material.specular_albedo,
+                material.roughness,
+                self.lobes,
+                self.directions,
+                unoccluded,
             )
         return closed_form_radiance(normal, view, material, self.shaded_lobes, visibility)
 
@@ -347,7 +443,7 @@ def unoccluded_directions(scene, head, x, normal, directions):
 
 def local_lobes(light, head):
     """The light's lobes [N_l, 7] with axes in the field's coordinates."""
-    rotation = rotation_of(head.to_local @ light.world_transform())
+    rotation = rotation_of(head.to_local @ light.rotation)
     axis, sharpness, amplitude = light.lobes[:, 0:3], light.lobes[:, 3:4], light.lobes[:, 4:7]
     return dr.concat([axis @ mi.TensorXf(rotation.T), sharpness, amplitude * mi.TensorXf(light.scale, (1, 1))], axis=1)
 

@@ -83,7 +83,8 @@ def test_yaw_turns_the_head_and_not_the_light(avatar_path, one_light):
     still, turned = (
         load("relight.xml", avatar=avatar_path, lights=one_light, integrator="sira_sg", yaw=yaw) for yaw in (0, 90)
     )
-    layers = [picture(scene) for scene in (still, turned)]
+    extra = mi.load_dict({"type": "sira_sg", "hide_emitters": True, "aovs": True})
+    layers = [mi.render(scene, integrator=extra, seed=1).numpy() for scene in (still, turned)]
     assert np.abs(layers[0][..., 10:13] - layers[1][..., 10:13]).max() > 0.02, "the albedo turns with the head"
     assert layers[1][..., :3].max() > 0.7 * layers[0][..., :3].max(), "the light still comes from the front"
     x, z = turned.shapes()[0].to_world.matrix.numpy()[[0, 2], [2, 2]].ravel()

@@ -60,7 +60,7 @@ def scene(avatar, avatar_path):
 
 
 def picture(scene, **options) -> np.ndarray:
-    integrator = mi.load_dict({"type": "sira_sg", "hide_emitters": True, **options})
+    integrator = mi.load_dict({"type": "sira_sg", "aovs": True, "hide_emitters": True, **options})
     return mi.render(scene, integrator=integrator, spp=4, seed=0).numpy()
 
 
@@ -125,7 +125,7 @@ def test_what_is_differentiated_is_exact(scene):
     key = next(k for k in params.keys() if k.endswith("k_s"))  # noqa: SIM118 (SceneParameters is no dict)
 
     def derivative(**options):
-        integrator = mi.load_dict({"type": "sira_sg", "hide_emitters": True, **options})
+        integrator = mi.load_dict({"type": "sira_sg", "aovs": True, "hide_emitters": True, **options})
         k_s = mi.Float(params[key].numpy())
         dr.enable_grad(k_s)
         params[key] = k_s

@@ -230,7 +230,7 @@ def shadowed(avatar_path):
     }
     integrators = {
         "path": ({"type": "path", "max_depth": 4}, 512),
-        "with": ({"type": "sira_sg", "visibility_directions": 128}, 8),
+        "with": ({"type": "sira_sg", "aovs": True, "visibility_directions": 128}, 8),
         "without": ({"type": "sira_sg", "visibility": False}, 8),
     }
     pictures = {}

@@ -199,7 +199,7 @@ def load_polish_scene(
 def measure_detail(scene: mi.Scene, avatar_path: Path) -> np.ndarray:
     """What the path-traced picture is multiplied by, by pixel [h, w, 3]: where the mesh is too coarse for the albedo,
     the networks' diffuse albedo over that between vertices; and the refinement of the avatar's light."""
-    closed_form = {"type": "sira_sg", "hide_emitters": True, "light_refinement": str(avatar_path)}
+    closed_form = {"type": "sira_sg", "hide_emitters": True, "aovs": True, "light_refinement": str(avatar_path)}
     exact = mi.render(scene, integrator=mi.load_dict(closed_form), spp=16, seed=mi.UInt32(0)).numpy()
     baked = mi.render(
         scene, integrator=mi.load_dict({"type": "aov", "aovs": "albedo:albedo"}), spp=16, seed=mi.UInt32(0)

@@ -121,7 +121,7 @@ def _sensor(path: Path, sensor: mi.Sensor, size: int) -> tuple[dict, int, int]:
 
 def _world_lobes(light: sg_envmap.SGEnvmap) -> np.ndarray:
     lobes = np.array(light.lobes.numpy(), np.float32).reshape(-1, 7)
-    rotation = np.array(light.world_transform().matrix.numpy(), np.float64).reshape(4, 4)[:3, :3]
+    rotation = np.array(light.rotation.matrix.numpy(), np.float64).reshape(4, 4)[:3, :3]
     lobes[:, :3] = lobes[:, :3] @ rotation.T
     lobes[:, 4:] *= float(np.ravel(light.scale.numpy())[0])
     return lobes

@@ -181,7 +181,7 @@ def hit_ratio(case: Case, head: NeuralSDF, side: int) -> Ratio:
 def compilation_ratio(case: Case, head: NeuralSDF, lobes: np.ndarray) -> Ratio:
     """Pictures by `sira_sg` of ever new rays, whose number of hits is new and asks for new kernels, against pictures of
     the same two sets of rays in turns. Kernels outlive the process, so the new seeds are taken from the clock."""
-    scene, plugin = case.scene(head, lobes), mi.load_dict({"type": "sira_sg", "hide_emitters": True})
+    scene, plugin = case.scene(head, lobes), mi.load_dict({"type": "sira_sg", "hide_emitters": True, "aovs": True})
     turns = itertools.cycle((1, 2))
     for _ in range(2):
         render(scene, plugin, 1, next(turns))
@@ -240,7 +240,7 @@ def random_avatar(width: int, seed: int = 0) -> Avatar:
 def width_costs(case: Case, lobes: np.ndarray, widths: tuple[int, ...] = WIDTHS, voxel: float = 0.1) -> list[Cost]:
     """Pictures by `sira_sg`, one sample a pixel, of round heads with networks of several widths, on meshes of spacing
     `voxel`."""
-    plugin, result = mi.load_dict({"type": "sira_sg", "hide_emitters": True}), []
+    plugin, result = mi.load_dict({"type": "sira_sg", "hide_emitters": True, "aovs": True}), []
     with tempfile.TemporaryDirectory() as folder:
         for width in widths:
             file = Path(folder) / f"{width}.safetensors"
