@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -319,7 +320,7 @@ class HeadShader:
             dr.eval(si, seen)
         radiance = dr.zeros(mi.Color3f, dr.width(seen))
         for bsdf in materials:
-            same: mi.Bool = si.bsdf() == mi.BSDFPtr(bsdf)
+            same: Any = si.bsdf() == mi.BSDFPtr(bsdf)  # the stubs call it an object
             index = dr.compress(seen & same)
             if dr.width(index) > 0:
                 columns = self._shade_other(bsdf, dr.gather(mi.SurfaceInteraction3f, si, index))
@@ -445,7 +446,9 @@ def local_lobes(light, head):
     """The light's lobes [N_l, 7] with axes in the field's coordinates."""
     rotation = rotation_of(head.to_local @ light.rotation)
     axis, sharpness, amplitude = light.lobes[:, 0:3], light.lobes[:, 3:4], light.lobes[:, 4:7]
-    return dr.concat([axis @ mi.TensorXf(rotation.T), sharpness, amplitude * mi.TensorXf(light.scale, (1, 1))], axis=1)
+    # Flat arrays: the adjoint of a tensor's broadcast is atomic.
+    scaled = mi.TensorXf(dr.ravel(amplitude) * light.scale, amplitude.shape)
+    return dr.concat([axis @ mi.TensorXf(rotation.T), sharpness, scaled], axis=1)
 
 
 def rotation_of(transform) -> np.ndarray:
