@@ -209,17 +209,6 @@ def test_shapes_beside_the_head_are_shaded():
     np.testing.assert_allclose(closed.mean(axis=(0, 1)), traced.mean(axis=(0, 1)), rtol=0.05)
 
 
-@pytest.mark.slow
-def test_shapes_beside_the_head_keep_the_lights_derivatives():
-    """By the light's scale, the picture is linear; the derivative has samples of its own."""
-    params = mi.traverse(made := scene({"type": "sira_sg"}, wall=WALL))
-    dr.enable_grad(params["light.scale"])
-    params.update()
-    total = dr.mean(mi.render(made, params, spp=1, seed=1)[:, :, :3], axis=None)
-    dr.backward(total)
-    np.testing.assert_allclose(dr.grad(params["light.scale"]).numpy(), total.numpy(), rtol=0.02)
-
-
 @pytest.mark.parametrize(
     ("part", "words"),
     [
