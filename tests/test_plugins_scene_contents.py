@@ -311,7 +311,7 @@ def test_the_scene_files_can_be_written_as_png(name, tmp_path):
         path = tmp_path / name
         write_scene(path, camera(40.0))
         write_lights(tmp_path / "lights.json", LOBES)
-        options["avatar"] = ""
+        options |= {"avatar": "", "refinement": ""}
     picture = mi.render(mi.load_file(str(path), **options))
     mi.util.write_bitmap(str(tmp_path / "head.png"), picture, write_async=False)
     written = np.array(mi.Bitmap(str(tmp_path / "head.png")))
