@@ -3,6 +3,8 @@ and a fitted environment keeps its light."""
 
 import sira_mi  # noqa: F401, I001  (first: Dr.Jit must find LLVM)
 
+from pathlib import Path
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,7 +18,8 @@ from doubles import shade_lobe_by_lobe  # noqa: E402
 from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
 from sira_mi.sg import brdf, integrals, lobes, shading  # noqa: E402
 from sira_mi.sg import fit_environment as fit  # noqa: E402
-from studies.numerics import physg  # noqa: E402
+from studies.data import read_figures  # noqa: E402
+from studies.numerics import physg, worst_errors  # noqa: E402
 
 SHARPNESS = np.geomspace(1e-3, 1e5, 33)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(500)
@@ -194,6 +197,28 @@ def specular_form(function, view, roughness, albedo, sharpness, axes):
         mi.Color3f(1),
     )
     return value.x.numpy()
+
+
+FIGURES = Path(__file__).parents[1] / "docs" / worst_errors.FIGURES
+BOUNDS = read_figures(FIGURES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", range(len(worst_errors.RANGES)))
+@pytest.mark.parametrize("view_angle", worst_errors.VIEW_ANGLES)
+def test_a_search_does_not_exceed_the_stated_bounds(k, view_angle):
+    """A short search with another seed, from random points and from those recorded, finds again what is recorded, and
+    nothing above the bound."""
+    recorded = BOUNDS["ranges"][k]["worst"][BOUNDS["view_angles"].index(view_angle)]["error"]
+    effort = worst_errors.Effort(starts=64, parents=4, children=4, steps=4, verified=2)
+    known = worst_errors.known_points(FIGURES)
+    found = worst_errors.search_worst(worst_errors.RANGES[k], view_angle, effort, seed=11, known=known).error
+    assert 95.0 * recorded < 100.0 * found <= worst_errors.stated_bound(recorded)
+
+
+def test_the_page_states_the_bounds_found():
+    page = (Path(__file__).parents[1] / "docs" / "shading.md").read_text(encoding="utf-8")
+    assert worst_errors.bounds_table(BOUNDS) in page
 
 
 @pytest.mark.slow
