@@ -149,14 +149,13 @@ class SiraSG(mi.SamplingIntegrator):
             columns = shader.shade(ray, hits, index)
 
         # Scatter: from the columns back to the rays.
-        parts, row = {}, 0
-        for name, rows in self.rows(refinement).items():
+        parts = {}
+        for layer, (name, rows) in enumerate(self.rows(refinement).items()):
             kind = mi.Color3f if rows == 3 else mi.Float
             part = dr.zeros(kind, width)
             if columns is not None:
-                part = scatter_columns(columns[row : row + rows, :], index, width, kind)
+                part = scatter_columns(columns[layer], index, width, kind)
             parts[name] = hits.spread(part)
-            row += rows
         t, hit = hits.spread(hits.t), hits.spread(hits.shaded)
         radiance = parts["diffuse"] + parts["specular"]
         if refinement is not None:
@@ -184,7 +183,7 @@ class SiraSG(mi.SamplingIntegrator):
         return self.refinement or light.refinement
 
     def rows(self, refinement: LightRefinement | None) -> dict[str, int]:
-        """Number of rows of each layer in the tensor that `HeadShader` returns."""
+        """Number of rows of each tensor that `HeadShader` returns, by the layer that it is."""
         names = ["diffuse", "specular", *(("diffuse_albedo", "specular_albedo", "normal") if self.aovs else ())]
         factor = {} if refinement is None else {"light_refinement": 3}
         return {name: channel_count(name) for name in names} | factor
@@ -286,7 +285,8 @@ def find_hits(scene, head, ray, active, samples: int, exact: bool) -> Hits:
 class HeadShader:
     """Eq. 8 and the extra channels at points of a head, as tensors in its field's coordinates, one column a point.
 
-    Results have the rows of `SiraSG.rows`. Without gradients (`attached`) points are evaluated in chunks."""
+    Results are the tensors of `SiraSG.rows`, apart: in the adjoint of rows cut from one tensor, gradients get lost at
+    random. Without gradients (`attached`) points are evaluated in chunks."""
 
     def __init__(self, integrator: SiraSG, scene, head, light, attached: bool):
         self.integrator, self.scene, self.head, self.attached = integrator, scene, head, attached
@@ -309,7 +309,7 @@ class HeadShader:
         if self.attached:
             return self._shade_field(differentiable_hit(self.field, origin, direction, dr.detach(t)), direction)
         x = on_ray(origin, direction, t)
-        return mi.TensorXf(evaluate_in_chunks(self._shade_field, x.numpy(), direction.numpy())[0])
+        return [mi.TensorXf(part) for part in evaluate_in_chunks(self._shade_field, x.numpy(), direction.numpy())]
 
     def shade_others(self, materials: list[mi.BSDF], ray, active) -> tuple[mi.Color3f, mi.Bool]:
         """Radiance of the shapes beside the head, whose BSDFs are `materials`, and which rays meet one of them first.
@@ -321,7 +321,7 @@ class HeadShader:
         radiance = dr.zeros(mi.Color3f, dr.width(seen))
         for bsdf in materials:
             same: Any = si.bsdf() == mi.BSDFPtr(bsdf)  # the stubs call it an object
-            index = dr.compress(seen & same)
+            index: mi.UInt32 = dr.compress(seen & same)
             if dr.width(index) > 0:
                 columns = self._shade_other(bsdf, dr.gather(mi.SurfaceInteraction3f, si, index))
                 radiance += scatter_columns(columns, index, dr.width(seen), mi.Color3f)
@@ -340,19 +340,19 @@ class HeadShader:
             columns = [to_columns(head.to_local @ si.p), normal, view, to_columns(dr.select(lit, albedo, 0.0))]
             glossy = isinstance(bsdf, SiraBSDF)
             if glossy:
-                specular = bsdf.specular_albedo.eval_1(si) + dr.zeros(mi.Float, count)
-                columns.append(to_columns(specular))
+                specular_albedo = bsdf.specular_albedo.eval_1(si) + dr.zeros(mi.Float, count)
+                columns.append(to_columns(specular_albedo))
         shine = dr.select(lit, 1.0, 0.0) if glossy else dr.zeros(mi.Float, count)
 
         def shade(x, normal, view, diffuse, specular=None):
             material = Material(diffuse, specular, *self._gloss(bsdf if glossy else self.bsdf))
-            return dr.concat([*self._radiance(x, normal, view, material)], axis=0)
+            return tuple(self._radiance(x, normal, view, material))
 
         if self.attached:
-            result = shade(*columns)
+            diffuse, specular = shade(*columns)
         else:
-            result = mi.TensorXf(evaluate_in_chunks(shade, *(c.numpy() for c in columns))[0])
-        return result[0:3, :] + result[3:6, :] * in_three(to_columns(shine))
+            diffuse, specular = map(mi.TensorXf, evaluate_in_chunks(shade, *(c.numpy() for c in columns)))
+        return diffuse + specular * in_three(to_columns(shine))
 
     @staticmethod
     def _gloss(bsdf: SiraBSDF) -> tuple:
@@ -369,7 +369,7 @@ class HeadShader:
         if (refinement := self.refinement) is not None:
             factor = evaluate_in_chunks(lambda p: refinement.factor(*deform(self.field, p)), x.numpy())[0]
             columns.append(mi.TensorXf(factor))
-        return mi.TensorXf(evaluate_in_chunks(self._shade_points, *(c.numpy() for c in columns))[0])
+        return [mi.TensorXf(part) for part in evaluate_in_chunks(self._shade_points, *(c.numpy() for c in columns))]
 
     def _shade_field(self, x, direction):
         """Points x [3, N] of the field's surface, seen along `direction` [3, N]."""
@@ -387,7 +387,7 @@ class HeadShader:
         material = Material(diffuse, specular if self.specular_term else None, *self._gloss(self.bsdf))
         radiance = self._radiance(x, normal, normalise(direction), material)
         extra = (diffuse, specular, self.to_world @ normal) if self.integrator.aovs else ()
-        return dr.concat([*radiance, *extra, *factor], axis=0)
+        return *radiance, *extra, *factor
 
     def _radiance(self, x, normal, view, material: Material) -> Radiance:
         visibility = None

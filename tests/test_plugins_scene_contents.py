@@ -209,6 +209,19 @@ def test_shapes_beside_the_head_are_shaded():
     np.testing.assert_allclose(closed.mean(axis=(0, 1)), traced.mean(axis=(0, 1)), rtol=0.05)
 
 
+@pytest.mark.slow
+def test_the_gradient_of_the_light_is_whole():
+    """By the light's scale, in which the picture is linear; the derivative has samples of its own. Repeated: parts of
+    the gradient must not get lost at random."""
+    for _ in range(8):
+        params = mi.traverse(made := scene({"type": "sira_sg"}, wall=WALL))
+        dr.enable_grad(params["light.scale"])
+        params.update()
+        total = dr.mean(mi.render(made, params, spp=1, seed=1)[:, :, :3], axis=None)
+        dr.backward(total)
+        np.testing.assert_allclose(dr.grad(params["light.scale"]).numpy(), total.numpy(), rtol=0.02)
+
+
 @pytest.mark.parametrize(
     ("part", "words"),
     [
