@@ -321,7 +321,7 @@ class HeadShader:
         radiance = dr.zeros(mi.Color3f, dr.width(seen))
         for bsdf in materials:
             same: Any = si.bsdf() == mi.BSDFPtr(bsdf)  # the stubs call it an object
-            index: mi.UInt32 = dr.compress(seen & same)
+            index: Any = dr.compress(seen & same)
             if dr.width(index) > 0:
                 columns = self._shade_other(bsdf, dr.gather(mi.SurfaceInteraction3f, si, index))
                 radiance += scatter_columns(columns, index, dr.width(seen), mi.Color3f)
