@@ -5,6 +5,7 @@ import sira_mi  # noqa: F401  (before Dr.Jit, which must find LLVM)
 
 # isort: split
 import dataclasses
+import signal
 
 import cv2
 import mitsuba as mi
@@ -23,6 +24,10 @@ from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.face import find_faces
 
 mi.set_variant("llvm_ad_rgb")
+
+# A runner in the background has Ctrl-C ignored, and its children would too: the tests of interrupts need it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SMALL = AvatarArchitecture(
     features=4,

@@ -125,7 +125,8 @@ def _fit_in_folder(request: FitRequest, work: Path, started: float) -> bool:
         report["polish"] = measure_polish(task, polish_stage(), progress.state)
     write_folder(request.out, task.pose_portrait(progress.state), avatar, task.settings, report, started)
     if complete:
-        (work / _CHECKPOINT).unlink()
+        for file in (work / _CHECKPOINT, task.avatar_file):
+            file.unlink(missing_ok=True)
     return complete
 
 
@@ -162,7 +163,6 @@ def prepare_fit(request: FitRequest, work: Path) -> FitTask:
         settings = replace(settings, stages=(*settings.stages, polish_stage()))
     prior_path = request.prior or PRIOR
     prior = load_prior(prior_path)
-    print("finding the face, its mask and the camera", file=sys.stderr)
     portrait = read_portrait(request, settings, prior)
     for note in portrait.notes:
         print(f"note: {note}", file=sys.stderr)

@@ -107,6 +107,11 @@ class FitTask:
         task._shared = self._shared
         return task
 
+    @property
+    def avatar_file(self) -> Path:
+        """Where `write_avatar` writes."""
+        return self.folder / "avatar.safetensors"
+
     def exposure(self) -> float:
         """Factor that brings the photo to the exposure of the photos that the rendering network was trained on."""
         return face_exposure(self.portrait, self.prior)
@@ -121,9 +126,8 @@ class FitTask:
 
     def write_avatar(self, state: FitState) -> Path:
         """Writes the avatar at `state` for the plugins to read; its path."""
-        path = self.folder / "avatar.safetensors"
-        save_avatar(path, self.prior.with_tensors(**state.avatar))
-        return path
+        save_avatar(self.avatar_file, self.prior.with_tensors(**state.avatar))
+        return self.avatar_file
 
     def share(self, kind: type[Shared], make: Callable[[], Shared]) -> Shared:
         """What consecutive stages have in common and is slow to make: the result of `make`, of class `kind`. It is
