@@ -55,10 +55,10 @@ def blur(image: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def look_up(image: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Bilinear values [..., 3] of a map [H, 2H, 3] in unit directions [..., 3]."""
+    """Bilinear values [..., 3] of a map [H, 2H, 3], its rows as in `pixel_directions`, in unit directions [..., 3]."""
     height, width = image.shape[:2]
     u = np.arctan2(directions[..., 0], -directions[..., 2]) / (2 * np.pi) % 1.0 * width - 0.5
-    v = np.clip(np.arccos(np.clip(directions[..., 1], -1, 1)) / np.pi * height - 0.5, 0, height - 1)
+    v = np.clip(np.arccos(np.clip(directions[..., 1], -1, 1)) / np.pi, 0, 1) * (height - 1)
     column, row = np.floor(u).astype(int), np.minimum(np.floor(v).astype(int), height - 2)
     fu, fv = (u - column)[..., None], (v - row)[..., None]
     left, right = column % width, (column + 1) % width
