@@ -383,6 +383,9 @@ def test_a_scene_file_becomes_observations(tmp_path):
 
 
 def test_bad_collections_are_named(tmp_path):
+    with pytest.raises(InputError, match=r"manifest\.json: no such manifest of a collection"):
+        load_training_scenes(tmp_path)
+    (tmp_path / "manifest.json").write_text("[]")
     with pytest.raises(InputError, match="not a collection"):
         load_training_scenes(tmp_path)
     (tmp_path / "manifest.json").write_text(json.dumps({"scenes": [{"file": "a.npz", "split": "train"}]}))

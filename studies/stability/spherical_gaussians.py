@@ -258,7 +258,8 @@ def measure_reflectance(quick: bool) -> Row:
     half = cases.normalise(view + light)
     sharpness, k = 2.0 / roughness**4, (roughness + 1.0) ** 2 / 8.0
     density = sharpness / (2.0 * np.pi) * np.exp(-0.5 * sharpness * ((half - n) ** 2).sum(axis=0))
-    cosine = (view * half).sum(axis=0)
+    # v·h of unit vectors; the rounding of their lengths, which v·h itself divides by |v + l|, hardly enters.
+    cosine = 0.5 * np.linalg.norm(view + light, axis=0)
     fresnel = albedo + (1.0 - albedo) * 2.0 ** (-(5.55473 * cosine + 6.8316) * cosine)
     masking = (cos_view * (1.0 - k) + k) * (cos_light * (1.0 - k) + k)
     exact = 0.25 * density * fresnel / masking
