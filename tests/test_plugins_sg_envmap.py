@@ -326,7 +326,7 @@ def test_bad_environment_files_are_named(tmp_path):
     image[3, 4, 1] = 1e30
     write_exr(path, image)
     expect("more than 1e.28")
-    image[3] = -1
+    image[3] = -2
     write_exr(path, image)
     expect("negative radiance")
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": np.ones((16, 32), np.float32)}) as file:
@@ -339,7 +339,7 @@ def test_environments_are_read_as_their_files_say(tmp_path):
     that reaches beyond the display window cut to it."""
     path, rng = tmp_path / "lights.exr", np.random.default_rng(0)
     image = rng.random((16, 32, 3)).astype(np.float32)
-    image[5, 6] = -0.01
+    image[5, 6] = -12  # 5% of the light, as in published maps
     write_exr(path, image)
     np.testing.assert_array_equal(lights_io.read_environment(path), np.maximum(image, 0))
     whole = np.zeros((64, 128, 3), np.float32)
