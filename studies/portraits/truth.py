@@ -1,5 +1,6 @@
 """The truth of a benchmark portrait, which only the scores use."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -42,6 +43,23 @@ class Truth:
     landmarks: np.ndarray  # [468, 3], NaN where unknown
 
 
+@dataclass(frozen=True, eq=False)
+class TrueView:
+    """The head of a portrait under another light, at the photo's pixels, path traced before a black background. Off the
+    person `region` is 255."""
+
+    image: np.ndarray  # [H, W, 3] float32, linear radiance under the environment as it is, premultiplied
+    mask: np.ndarray  # [H, W] float32, coverage, 0 to 1
+    region: np.ndarray  # [H, W] uint8 of the first hit at the pixel's centre, codes as in `Truth.region`
+    face: np.ndarray  # [H, W] bool, skin and eyes within 95 mm of the nose tip
+    light: str  # name of the environment in the benchmark's `lights`
+    yaw: float  # degrees that the head has turned to its own left about the vertical through its origin
+
+
+# For each view, which of the portrait's two environments lights it, and how far the head has turned, degrees.
+VIEWS = {"relit_1": (0, 0.0), "relit_2": (1, 0.0), "turned_left": (0, 30.0), "turned_right": (0, -30.0)}
+
+
 def load_truth(path: str | Path) -> Truth:
     """Reads a `truth.npz`. Raises InputError that names the first array that is missing, misshapen or not finite."""
     path = Path(path)
@@ -79,6 +97,40 @@ def load_truth(path: str | Path) -> Truth:
         landmarks=landmarks,
         **images,
     )
+
+
+def load_views(folder: str | Path) -> dict[str, TrueView]:
+    """Reads `views.npz` and `portrait.json` of a portrait's folder: a view for each of `VIEWS`. Raises InputError that
+    names the first array that is missing, misshapen or out of range."""
+    path = Path(folder) / "views.npz"
+    try:
+        relights = json.loads((path.with_name("portrait.json")).read_text(encoding="utf-8"))["entry"]["relights"]
+        lights = {name: str(relights[light]) for name, (light, _) in VIEWS.items()}
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: {key: file[f"{name}_{key}"] for key in ("image", "mask", "region", "face")} for name in VIEWS}
+    except (OSError, KeyError, IndexError, TypeError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"{folder} holds no views of a portrait: {error}; build the benchmark again") from error
+    size = data["relit_1"]["mask"].shape
+    if len(size) != 2 or 0 in size:
+        raise InputError(f"{path}: relit_1_mask must be an image [H, W]")
+    result = {}
+    for name, arrays in data.items():
+        for key, array in arrays.items():
+            check_array(f"{path}: {name}_{key}", array, (*size, 3) if key == "image" else size)
+        if arrays["image"].min() < 0:
+            raise InputError(f"{path}: {name}_image must not be negative")
+        for key, kind in (("mask", "u"), ("region", "u"), ("face", "b")):
+            if arrays[key].dtype.kind != kind:
+                raise InputError(f"{path}: {name}_{key} must be of type {kind}1, not {arrays[key].dtype}")
+        result[name] = TrueView(
+            image=arrays["image"].astype(np.float32),
+            mask=arrays["mask"].astype(np.float32) / 255,
+            region=arrays["region"],
+            face=arrays["face"],
+            light=lights[name],
+            yaw=VIEWS[name][1],
+        )
+    return result
 
 
 def check_array(name: str, array: np.ndarray, shape: tuple, finite: bool = True) -> None:
