@@ -290,7 +290,7 @@ def test_portrait_of_the_test_photo(photo_file, head, astronaut, mask):
     assert portrait.mask.shape == (512, 512) and portrait.landmarks.shape == (LANDMARKS, 2)
     assert np.array_equal(portrait.mask, mask)
     assert measure_reprojection_error(portrait.camera, portrait.head_landmarks, head) < 3
-    assert portrait.camera.world_to_camera[2, 3] > 4
+    assert portrait.camera.world_to_camera[2, 3] > 4 and portrait.window == (0, 0, 512, 512)
     again = make_portrait(photo_file, SETTINGS, head)
     assert np.array_equal(again.image, portrait.image) and np.array_equal(again.mask, portrait.mask)
     assert np.array_equal(again.landmarks, portrait.landmarks) and np.array_equal(again.camera.K, portrait.camera.K)
@@ -305,6 +305,9 @@ def test_small_face_in_a_large_photo_is_cropped(tmp_path, head, astronaut, face)
     assert max(portrait.image.shape) <= 256 and any("cropped" in note for note in portrait.notes)
     size = np.ptp(portrait.landmarks, axis=0).max()
     assert size > 0.2 * 256
+    x0, y0, x1, y1 = portrait.window
+    scale = np.array([x1 - x0, y1 - y0]) / portrait.image.shape[1::-1]
+    assert np.linalg.norm(portrait.landmarks * scale + [x0, y0] - face.landmarks - [900, 300], axis=1).mean() < 2
     np.testing.assert_allclose(portrait.camera.K[0, 0], portrait.camera.K[1, 1])
     assert measure_reprojection_error(portrait.camera, portrait.head_landmarks, head) < 0.03 * size
     relit = find_faces((linear_to_srgb(portrait.image) * 255 + 0.5).astype(np.uint8))[0]

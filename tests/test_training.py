@@ -145,6 +145,26 @@ def test_the_terms_that_can_be_left_out_are_those_of_the_losses(collection):
         train.without_term(settings, train.SHAPE_TERMS, "learning_rate")
 
 
+def test_a_training_on_some_sources_sees_no_scene_of_the_others(tmp_path):
+    """And goes on from no training on others: heads of a generator that is left out would not be unseen."""
+    manifest = json.loads((ball_collection(tmp_path) / "manifest.json").read_text())
+    for entry, source in zip(manifest["scenes"], ("balls", "eggs", "balls", "eggs", "balls"), strict=True):
+        entry["source"] = source
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    balls = load_training_scenes(tmp_path, ["balls"])
+    assert [float(np.linalg.norm(scene.points[0])) for scene in balls] == pytest.approx([1.1, 1.2], abs=1e-5)
+    assert len(load_training_scenes(tmp_path, ["eggs", "balls"])) == len(load_training_scenes(tmp_path)) == 3
+    with pytest.raises(InputError, match="1 training scenes"):
+        load_training_scenes(tmp_path, ["eggs"])
+    with pytest.raises(InputError, match="no training scenes of cubes; its sources are balls, eggs"):
+        load_training_scenes(tmp_path, ["cubes", "balls"])
+    some, others, everything = (
+        train.describe(SMALL, sa_sm.ShapeTraining(), 0, sources) for sources in (("a", "b"), ("b",), ())
+    )
+    assert some != others and some == train.describe(SMALL, sa_sm.ShapeTraining(), 0, ("b", "a"))
+    assert "sources" not in json.loads(everything["settings"])
+
+
 @pytest.mark.slow
 def test_so_are_those_of_the_appearance(collection, run):
     """All but the colour, whose weight is 1."""

@@ -275,6 +275,7 @@ def write_folder(
     report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
     report["psnr_of_unrefined_light_db"] = round(psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
+    report["window"] = portrait.window
     report["exposure"] = portrait.exposure
     report["seconds"]["output"] = round(time.monotonic() - begun, 2)
     report["seconds"]["total"] = round(time.monotonic() - started, 2)

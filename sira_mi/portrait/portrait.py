@@ -39,6 +39,7 @@ class Portrait:
     camera: Camera  # of `image`, with square pixels
     notes: tuple[str, ...]  # messages for the user, one line each
     exposure: float = 1.0  # other than 1 only for photos that store radiance, whose unit is arbitrary
+    window: tuple[float, ...] | None = None  # x0, y0, x1, y1: where `image` lies in the photo, the photo's pixels
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,11 @@ class _Window:
     scale_y: float
     width: int
     height: int
+
+    @property
+    def edges(self) -> tuple[float, float, float, float]:
+        """x0, y0, x1, y1 in pixels of the photo."""
+        return self.x0, self.y0, self.x0 + self.width / self.scale_x, self.y0 + self.height / self.scale_y
 
     def to_working(self, points: np.ndarray) -> np.ndarray:
         return (points - [self.x0, self.y0]) * [self.scale_x, self.scale_y]
@@ -118,7 +124,8 @@ def make_portrait(
         if error > _CAMERA_MISMATCH * working_face.size:
             notes.append(f"the given camera shows the head {error:.0f} pixels away from the face in the photo")
     image, mask = image.astype(np.float32), mask.astype(np.float32)
-    return Portrait(image, mask, landmarks, of_head, camera, tuple(notes), exposure)
+    edges = tuple(edge * photo.reduction for edge in window.edges)
+    return Portrait(image, mask, landmarks, of_head, camera, tuple(notes), exposure, edges)
 
 
 def make_display_image(image: np.ndarray) -> np.ndarray:

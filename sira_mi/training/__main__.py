@@ -17,6 +17,9 @@ def main() -> None:
         "--collection", type=Path, required=True, help="folder of python -m sira_mi.training.collection build"
     )
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, logs, pictures and the prior")
+    parser.add_argument(
+        "--sources", nargs="+", default=[], metavar="NAME", help="scenes of these sources alone (default: all)"
+    )
     parser.add_argument("--steps", type=int, help="number of steps (default: the model's)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--without", metavar="TERM", help="loss term to leave out: its weight becomes zero")
@@ -44,6 +47,7 @@ def main() -> None:
         train(
             arguments.collection,
             arguments.out,
+            sources=arguments.sources,
             steps=arguments.steps,
             seed=arguments.seed,
             without=arguments.without,

@@ -4,6 +4,7 @@ Albedo truth is in the scene files too, but is not loaded here: training never s
 `HELD_OUT_VIEWS`, on which renderings are compared.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
@@ -75,15 +76,23 @@ def load_scene(path: Path) -> TrainingScene:
     )
 
 
-def load_training_scenes(folder: Path) -> list[TrainingScene]:
-    """All scenes of the manifest's training split. Raises InputError when there are fewer than two."""
+def load_training_scenes(folder: Path, sources: Sequence[str] = ()) -> list[TrainingScene]:
+    """The scenes of the manifest's training split, of `sources` where these are named. Raises InputError for a source
+    that has none, and when there are fewer than two scenes."""
     try:
         manifest = read_json(folder / "manifest.json", "manifest of a collection", _MAXIMUM_MANIFEST_BYTES)
-        names = [scene["file"] for scene in manifest["scenes"] if scene["split"] == "train" and "error" not in scene]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        scenes = [scene for scene in manifest["scenes"] if scene["split"] == "train" and "error" not in scene]
+        files = [(str(scene["file"]), scene.get("source")) for scene in scenes]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{folder} is not a collection: {error}; build one with python -m sira_mi.training.collection"
         ) from error
+    known = sorted({str(source) for _, source in files})
+    if unknown := set(sources) - set(known):
+        raise InputError(
+            f"{folder} has no training scenes of {', '.join(sorted(unknown))}; its sources are {', '.join(known)}"
+        )
+    names = [Path(file).name for file, source in files if not sources or source in sources]
     if len(names) < 2:
         raise InputError(f"{folder} has {len(names)} training scenes; at least two are needed")
-    return [load_scene(folder / Path(name).name) for name in names]
+    return [load_scene(folder / name) for name in names]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +82,11 @@ def read_architecture(metadata: dict[str, str], checkpoint: Path) -> AvatarArchi
         raise InputError(f"{checkpoint} does not say its architecture ({error}); train it again") from error
 
 
-def describe(architecture: AvatarArchitecture, settings, seed: int) -> dict[str, str]:
+def describe(architecture: AvatarArchitecture, settings, seed: int, sources: Sequence[str]) -> dict[str, str]:
     """What a resumed training must have in common with the one that it continues: all but the number of steps."""
     values = {k: v for k, v in dataclasses.asdict(settings).items() if k != "steps"}
+    if sources:
+        values["sources"] = sorted(sources)
     return {
         "architecture": json.dumps(architecture.to_dict(), sort_keys=True),
         "settings": json.dumps({**values, "seed": seed}, sort_keys=True),
@@ -99,15 +102,17 @@ def train_shape(
     without: str | None = None,
     sizes: dict[str, int] | None = None,
     picture_steps: int = 1000,
+    sources: Sequence[str] = (),
     scenes: list | None = None,
 ) -> dict[str, np.ndarray]:
     """Trains the SA-SM; returns its networks and latents [dim, scenes]. `without` names a loss term to leave out,
-    `sizes` those that differ from AvatarArchitecture's; `scenes` are the collection's if they are loaded already."""
+    `sizes` those that differ from AvatarArchitecture's, `sources` those of the collection to train on, or all; `scenes`
+    are their scenes if they are loaded already."""
     architecture = with_sizes(AvatarArchitecture(), sizes or {})
     settings = without_term(sa_sm.ShapeTraining(), SHAPE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
-    scenes = scenes or load_training_scenes(collection)
+    scenes = scenes or load_training_scenes(collection, sources)
     initial = sa_sm.initial_shape_model(architecture, settings, len(scenes), seed)
     optimizer = adam(initial, sa_sm.rates(settings, 0))
 
@@ -126,7 +131,7 @@ def train_shape(
         lambda k: sa_sm.rates(settings, k),
         step,
         weights={name: getattr(settings, name) for name in SHAPE_TERMS},
-        description=describe(architecture, settings, seed),
+        description=describe(architecture, settings, seed, sources),
         picture=picture,
         picture_steps=picture_steps,
     )
@@ -141,11 +146,12 @@ def train_appearance(
     without: str | None = None,
     sizes: dict[str, int] | None = None,
     picture_steps: int = 1000,
+    sources: Sequence[str] = (),
     scenes: list | None = None,
 ) -> None:
     """Trains the AF-SM on the SA-SM of `out/shape.checkpoint`, whose architecture it takes over; writes
-    `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only; `scenes` are the
-    collection's if they are loaded already."""
+    `out/prior.safetensors`. `sizes` may change the networks of the AF-SM and of the refinement only; `sources`
+    and `scenes` are as in `train_shape`."""
     checkpoint = out / "shape.checkpoint"
     if not checkpoint.exists():
         raise InputError(f"{checkpoint} is missing; run python -m sira_mi.training shape first")
@@ -159,7 +165,7 @@ def train_appearance(
     settings = without_term(af_sm.AppearanceTraining(), APPEARANCE_TERMS, without)
     if steps is not None:
         settings = dataclasses.replace(settings, steps=steps)
-    scenes = scenes or load_training_scenes(collection)
+    scenes = scenes or load_training_scenes(collection, sources)
     if any(shape[name].shape != (architecture.networks[name].parameters,) for name in NETWORKS):
         raise InputError(f"{checkpoint} does not fit its architecture; train it again")
     if any(shape[name].shape != (architecture.latents[name], len(scenes)) for name in LATENTS):
@@ -183,7 +189,7 @@ def train_appearance(
         lambda k: af_sm.rates(settings, k),
         step,
         weights={name: getattr(settings, name) for name in APPEARANCE_TERMS},
-        description=describe(architecture, settings, seed),
+        description=describe(architecture, settings, seed, sources),
         picture=AppearancePicture(architecture, shape, scenes, settings.roughness).write,
         picture_steps=picture_steps,
     )
