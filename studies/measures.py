@@ -1,12 +1,15 @@
-"""Measures of numbers and images against the truth: statistics, SSIM, scaling, leakage, each independent of any model;
-and the definitions of face, head and specular strength that all studies share. PSNR is `relight.pictures.psnr`."""
+"""Measures of numbers and images against the truth: statistics, SSIM, FLIP, scaling, leakage, each independent of any
+model; and the definitions of face, head and specular strength that all studies share. PSNR is
+`relight.pictures.psnr`."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import LUMINANCE
+from sira_mi.errors import InputError
 
 FACE_RADIUS = 95.0  # mm around the nose tip
 SHOULDERS = -1.3  # y above which a point belongs to the head, scene units
@@ -48,16 +51,35 @@ def scale_channels(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def ssim_inside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Mean structural similarity over the pixels of `mask` [H, W] of two images [H, W] or [H, W, 3] of values in
-    [0, 1]; both are black outside. Data range 1, uniform windows of 7 x 7 pixels, channels averaged. NaN for an empty
-    mask."""
-    if not mask.any():
-        return float("nan")
+    """Mean of `map_ssim` over the pixels of `mask` [H, W]; NaN for an empty mask."""
+    return float(map_ssim(image, truth, mask)[mask].mean()) if mask.any() else float("nan")
+
+
+def map_ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Structural similarity [H, W] of two images [H, W] or [H, W, 3] of values in [0, 1], both black outside `mask`
+    [H, W]. Data range 1, uniform windows of 7 x 7 pixels, channels averaged."""
     inside = mask if image.ndim == 2 else mask[..., None]
     axis = None if image.ndim == 2 else 2
     first, second = (np.where(inside, a, 0).astype(np.float64) for a in (image, truth))
     similarity = structural_similarity(first, second, data_range=1.0, channel_axis=axis, full=True)[1]
-    return float(similarity[mask].mean())
+    return similarity if image.ndim == 2 else similarity.mean(axis=2)
+
+
+def require_flip():
+    """The package that computes FLIP. InputError when it is not installed."""
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise InputError("FLIP needs an optional package; install it with: pip install 'sira-mi[plots]'") from error
+    return flip_evaluator
+
+
+def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
+    """Mean LDR-FLIP (Andersson et al. 2020; 67 pixels a degree) over `mask` of two pictures [H, W, 3] of linear
+    radiance, shown in sRGB. InputError when the package for it is missing."""
+    shown = (np.ascontiguousarray(linear_to_srgb(np.clip(a, 0, 1)), np.float32) for a in (reference, image))
+    errors = require_flip().evaluate(*shown, "LDR", applyMagma=False, computeMeanError=False)[0]
+    return float(np.asarray(errors).reshape(mask.shape)[mask].mean())
 
 
 def luminance(values: np.ndarray) -> np.ndarray:

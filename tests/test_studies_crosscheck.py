@@ -14,6 +14,7 @@ import pytest
 from conftest import camera
 
 from sira_mi.export import scene as scenes
+from studies import measures
 from studies.crosscheck import causes, curves, forms, images, page, plots, speed
 from studies.crosscheck.__main__ import _command, main
 from studies.crosscheck.case import Case, load_case
@@ -111,7 +112,7 @@ def test_errors_do_not_hold_the_noise_of_the_reference():
 def test_flip_is_zero_for_equal_pictures_and_grows_with_the_difference():
     rng, mask = np.random.default_rng(3), np.ones((32, 32), bool)
     picture = rng.uniform(0.1, 0.9, (32, 32, 3))
-    found = [images.flip(picture + shift, picture, mask) for shift in (0.0, 0.02, 0.1)]
+    found = [measures.flip(picture + shift, picture, mask) for shift in (0.0, 0.02, 0.1)]
     assert found[0] < 1e-6 < found[1] < found[2] < 1
 
 
@@ -357,7 +358,7 @@ def test_rows_of_fits_that_are_none(tmp_path):
 def test_plots_say_which_extra_is_missing(monkeypatch):
     for module in ("matplotlib", "flip_evaluator"):
         monkeypatch.setitem(sys.modules, module, None)
-    for need in (plots.pyplot, images.require_flip):
+    for need in (plots.pyplot, measures.require_flip):
         with pytest.raises(InputError, match=r"sira-mi\[plots\]"):
             need()
 

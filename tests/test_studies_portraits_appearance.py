@@ -5,9 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 from egg import CLOTH, SIZE, head_like, truth_of
+from scipy.ndimage import binary_erosion
 
+from sira_mi.colour import linear_to_srgb, srgb_to_linear
 from sira_mi.errors import InputError
-from studies.portraits.appearance_scores import PredictedAppearance, score_appearance
+from studies.portraits.appearance_scores import (
+    PredictedAppearance,
+    measure_ita,
+    score_appearance,
+    score_tone,
+)
 from studies.portraits.truth import Truth
 
 
@@ -119,3 +126,42 @@ def test_hair_and_cloth_are_not_skin(truth):
 def test_images_of_another_size_are_refused(truth):
     with pytest.raises(InputError, match="specular_albedo must be numbers"):
         score_appearance(appearance_of(truth, specular_albedo=truth.image), truth)
+
+
+@pytest.mark.filterwarnings("ignore:.*Matplotlib")
+def test_an_albedo_one_stop_too_light_has_a_bias_of_one_stop(truth):
+    """And its typology angle moves as another implementation of CIELAB says; other skin than the face's does not
+    count."""
+    import colour
+
+    tone = np.array([0.2, 0.12, 0.08])
+    inside = truth.mask > 0
+    face = inside & (np.arange(SIZE)[:, None] < SIZE // 2)
+    texture = np.random.default_rng(5).uniform(0.8, 1.2, (SIZE, SIZE, 1))
+    skin = dataclasses.replace(truth, diffuse_albedo=np.where(inside[..., None], tone * texture, 0))
+    lighter = np.where(face[..., None], 2 * skin.diffuse_albedo, 0.1)
+    scores = score_tone(appearance_of(skin, diffuse_albedo=lighter), skin, face)
+    assert scores["tone_bias"] == pytest.approx(1)
+
+    def ita(albedo):
+        lightness, _, yellow = colour.XYZ_to_Lab(colour.RGB_to_XYZ(albedo, "sRGB"))
+        return np.degrees(np.arctan2(lightness - 50, yellow))
+
+    mean = skin.diffuse_albedo[face].mean(axis=0)
+    assert scores["tone_ita"] == pytest.approx(ita(mean), abs=0.3)
+    assert scores["tone_ita_error"] == pytest.approx(ita(2 * mean) - ita(mean), abs=0.3) and ita(2 * mean) > ita(mean)
+    assert score_tone(appearance_of(skin), skin, face)["tone_ita_error"] == 0
+    assert np.isnan(list(score_tone(appearance_of(skin), skin, ~inside).values())).all()
+    assert measure_ita(np.array([0.65, 0.5, 0.4])) > 41 > 10 > measure_ita(np.array([0.09, 0.045, 0.03]))
+
+
+def test_specular_gain_is_over_the_best_single_grey(truth):
+    """The mean of the true strengths as sRGB shows them gains nothing; half its error gains 6 dB."""
+    inside = truth.mask > 0
+    shown = linear_to_srgb(truth.specular_albedo / 0.08)
+    eroded = binary_erosion(inside, np.ones((3, 3), bool), border_value=1)
+    mean = shown[eroded].mean()
+    for between, gain in ((0.0, 0.0), (0.5, 20 * np.log10(2))):
+        guess = 0.08 * srgb_to_linear(np.where(inside, mean + between * (shown - mean), 0))
+        scores = score_appearance(appearance_of(truth, specular_albedo=guess), truth)
+        assert scores["specular_gain"] == pytest.approx(gain, abs=1e-3)

@@ -10,9 +10,12 @@ from egg import HAIR, SIZE, SKIN, head_like, landmarks_on, truth_of, turned_came
 from scipy.spatial.transform import Rotation
 
 from sira_mi.errors import InputError
+from sira_mi.portrait.landmarks import INNER_EYE_CORNERS, MOUTH_CORNERS
 from sira_mi.training.collection.similarity import Similarity
 from studies.portraits.alignment import Icp, distances_from, icp, inverse
 from studies.portraits.geometry_scores import (
+    EARS,
+    REGIONS,
     GeometrySettings,
     PredictedHead,
     score_geometry,
@@ -155,8 +158,10 @@ def test_a_similar_head_is_no_error_in_any_frame_but_the_raw_camera(truth, surfa
     scores = score_geometry(prediction, truth, surface, QUICK)
     for name in ("h3ds", "landmarks", "camera"):
         assert scores[f"{name}_scale"] == pytest.approx(1.08, rel=1e-6)
-        for region in ("face", "face_all", "head", "seen", "hidden"):
+        for region in REGIONS:
             assert scores[f"{name}_{region}_mean"] < 1e-3, (name, region)
+    assert scores["camera_distance_error"] == pytest.approx(100 / 1.08 - 100)
+    assert scores["pose_error"] < 0.01 and scores["camera_turn"] == pytest.approx(scores["h3ds_turn"], abs=0.01)
     assert scores["h3ds_turn"] == pytest.approx(scores["landmarks_turn"], abs=1e-3)
     assert scores["landmarks_rms"] < 1e-6 and scores["landmarks_used"] == 6
     assert scores["camera_raw_scale"] == 1 and scores["camera_raw_head_mean"] > 20
@@ -164,6 +169,35 @@ def test_a_similar_head_is_no_error_in_any_frame_but_the_raw_camera(truth, surfa
     assert scores["silhouette_iou"] == 1
     again = score_geometry(prediction, truth, None, QUICK)
     assert again == scores
+
+
+@pytest.mark.slow
+def test_a_mirrored_head_is_another_head(truth, surface):
+    """The egg has no symmetry: no alignment brings its mirror image onto it."""
+    mirror = np.array([-1, 1, 1])
+    swapped = truth.landmarks * mirror
+    swapped[[INNER_EYE_CORNERS, MOUTH_CORNERS]] = swapped[[INNER_EYE_CORNERS[::-1], MOUTH_CORNERS[::-1]]]
+    mirrored = copy_of(truth, vertices=truth.vertices * mirror, faces=truth.faces[:, ::-1], landmarks=swapped)
+    scores = score_geometry(mirrored, truth, surface, QUICK)
+    assert scores["h3ds_face_mean"] > 0.2 and scores["camera_face_mean"] > 2 and scores["h3ds_head_mean"] > 3
+    assert scores["silhouette_iou"] < 0.97 and scores["normals_mean"] > 3
+
+
+@pytest.mark.slow
+def test_an_ear_that_sticks_out_costs_there_alone(truth, surface):
+    """2 mm of one ear: the points within 45 mm of the ears are off by some of that, those of the face by nothing. That
+    the camera is turned by 3 degrees is an error of the pose."""
+    away = np.linalg.norm(truth.vertices - EARS[1], axis=1)
+    bump = 0.02 * np.clip(1 - away / 0.4, 0, 1)[:, None] * [1, 0, 0]
+    nodded = truth.camera.world_to_camera.copy()
+    nodded[:3, :3] = Rotation.from_euler("x", 3, degrees=True).as_matrix() @ nodded[:3, :3]
+    camera = dataclasses.replace(truth.camera, world_to_camera=nodded)
+    scores = score_geometry(copy_of(truth, vertices=truth.vertices + bump, camera=camera), truth, surface, QUICK)
+    assert scores["pose_error"] == pytest.approx(3, abs=0.05)
+    for direction in ("truth_to_prediction", "prediction_to_truth"):
+        assert scores[f"landmarks_ears_{direction}_points"] > 100
+        assert 0.1 < scores[f"landmarks_ears_{direction}_mean"] < 1
+        assert scores[f"landmarks_face_{direction}_mean"] < 0.1 * scores[f"landmarks_ears_{direction}_mean"]
 
 
 @pytest.mark.slow

@@ -93,10 +93,10 @@ def main(arguments: list[str] | None = None) -> int:
     from studies.crosscheck.case import load_case
     from studies.crosscheck.curves import Point
     from studies.crosscheck.fits import read_fits
-    from studies.crosscheck.images import require_flip
     from studies.crosscheck.lights import SETTINGS
     from studies.crosscheck.plots import plot_curves, plot_fits, plot_sheet, pyplot
     from studies.crosscheck.run import Settings, choose_lights, measure
+    from studies.measures import require_flip
 
     if unknown := set(options.lights or ()) - set(SETTINGS):
         raise InputError(f"unknown lights {', '.join(sorted(unknown))}; known are {', '.join(SETTINGS)}")

@@ -15,7 +15,6 @@ from studies.crosscheck.case import Case
 from studies.crosscheck.images import (
     Estimate,
     LaunchLog,
-    flip,
     mean_square,
     path,
     relative_error,
@@ -24,6 +23,7 @@ from studies.crosscheck.images import (
     root,
 )
 from studies.crosscheck.points import field_points
+from studies.measures import flip
 
 PHYSG, FORM, VISIBLE = "a: PhySG", "b: closed form", "c: with visibility (sira_sg)"
 SHARED = "c: with visibility, shared by samples"

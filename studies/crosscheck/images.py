@@ -11,9 +11,6 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.colour import linear_to_srgb
-from sira_mi.errors import InputError
-
 # Rays of one launch.
 _LAUNCH = 1 << 21
 # Tries of a launch, with other seeds, while it has values that are not finite.
@@ -132,20 +129,3 @@ def relative_error(image: np.ndarray, reference: Estimate, mask: np.ndarray) -> 
     counts, the reference's does not."""
     level = max(float(reference.mean[mask].mean()), 1e-12)
     return root(mean_square(image - reference.halves[0], image - reference.halves[1], mask)) / level
-
-
-def require_flip():
-    """The package that computes FLIP. InputError when it is not installed."""
-    try:
-        import flip_evaluator
-    except ImportError as error:
-        raise InputError("FLIP needs an optional package; install it with: pip install 'sira-mi[plots]'") from error
-    return flip_evaluator
-
-
-def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> float:
-    """Mean LDR-FLIP (Andersson et al. 2020; 67 pixels a degree) over `mask` of two pictures [H, W, 3] of linear
-    radiance, shown in sRGB. InputError when the package for it is missing."""
-    shown = (np.ascontiguousarray(linear_to_srgb(np.clip(a, 0, 1)), np.float32) for a in (reference, image))
-    errors = require_flip().evaluate(*shown, "LDR", applyMagma=False, computeMeanError=False)[0]
-    return float(np.asarray(errors).reshape(mask.shape)[mask].mean())

@@ -39,7 +39,8 @@ def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str,
 
     `final_`, `shaded_`, `diffuse_`, `diffuse_scaled_`, `specular_` and `specular_scaled_` `psnr` (dB) and `ssim`;
     `skin_ciede2000_mean`, `_median`, and after the scale of the skin's own pixels `skin_scaled_ciede2000_mean`,
-    `_median`; the scores of `leakage_scores`. Counts: `pixels` compared and `skin_pixels` of them; `lost_pixels`, that
+    `_median`; `specular_gain`, the specular PSNR over that of the best constant, dB; the scores of `leakage_scores`.
+    Counts: `pixels` compared and `skin_pixels` of them; `lost_pixels`, that
     only the truth covers; `final_`, `shaded_`, `diffuse_` and `specular_nonfinite`, predicted values among those
     compared that are NaN or infinite: they count as black. Without pixels the scores are NaN. Raises InputError for
     images that are not of the photo's size."""
@@ -72,6 +73,7 @@ def score_appearance(prediction: PredictedAppearance, truth: Truth) -> dict[str,
             scores |= image_scores(f"{name}_scaled_", _scale_inside(values, true, inside), true, inside)
         if name == "diffuse":
             albedo = values[skin]
+    scores["specular_gain"] = scores["specular_psnr"] - _constant_psnr(pairs["specular"][1][inside])
     true = truth.diffuse_albedo[skin].astype(np.float64)
     scores |= colour_scores("skin_", albedo, true)
     scores |= colour_scores("skin_scaled_", scale_channels(albedo, true), true)
@@ -99,6 +101,29 @@ def colour_scores(prefix: str, albedo: np.ndarray, truth: np.ndarray) -> dict[st
     }
 
 
+def score_tone(prediction: PredictedAppearance, truth: Truth, face: np.ndarray) -> dict[str, float]:
+    """Level and colour of the skin's albedo over the skin pixels of `face` [H, W] bool inside both masks, of the mean
+    linear albedos there: `tone_bias`, stops of luminance by which the prediction is too light; `tone_ita`, the true
+    individual typology angle (Chardon et al. 1991: `measure_ita`), and `tone_ita_error`, degrees by which the
+    prediction's is larger. NaN when there are no such pixels, and for a black albedo."""
+    where = face & (truth.region == SKIN) & (truth.mask > 0.5) & (prediction.mask > 0.5)
+    values = prediction.diffuse_albedo[where].astype(np.float64)
+    names = ("tone_bias", "tone_ita", "tone_ita_error")
+    if not where.any() or not np.isfinite(values).all() or values.max() <= 0:
+        return dict.fromkeys(names, float("nan"))
+    mean, true = values.mean(axis=0), truth.diffuse_albedo[where].astype(np.float64).mean(axis=0)
+    ita, true_ita = measure_ita(mean), measure_ita(true)
+    bias = float(np.log2(luminance(mean) / luminance(true)))
+    return dict(zip(names, (bias, true_ita, ita - true_ita), strict=True))
+
+
+def measure_ita(albedo: np.ndarray) -> float:
+    """Individual typology angle atan2(L* - 50, b*) in degrees of a linear colour [3], clipped to sRGB's gamut, in
+    CIELAB under D65: above 55 very light, 41 light, 28 intermediate, 10 tan, -30 brown, below dark skin."""
+    lightness, _, yellow = rgb2lab(linear_to_srgb(albedo))
+    return float(np.degrees(np.arctan2(lightness - 50, yellow)))
+
+
 def leakage_scores(albedo: np.ndarray, truth: np.ndarray, shading: np.ndarray, shadow: np.ndarray) -> dict[str, float]:
     """Light that leaked into the albedo, over pixels of albedos [N, 3]: Pearson's correlation of the error of the
     log albedo's luminance with the log of `shading` [N], `leakage_shading`, and with `shadow` [N], `leakage_shadow`,
@@ -116,6 +141,12 @@ def leakage_scores(albedo: np.ndarray, truth: np.ndarray, shading: np.ndarray, s
         "leakage_shadow_signed": by_shadow,
         "leakage_slope": float(slope),
     }
+
+
+def _constant_psnr(values):
+    """PSNR of the constant that is closest to linear values [N], as sRGB-coded values."""
+    shown = linear_to_srgb(values)
+    return psnr(np.full(shown.shape, shown.mean() if len(shown) else 0.0), shown)
 
 
 def _scale_inside(values, truth, inside):

@@ -13,6 +13,7 @@ in these regions of the truth. A predicted point is assigned by its position and
 
     face      within 95 mm of the nose tip, skin and eyes only: what hair or cloth covers does not count
     face_all  the same sphere, with everything in it
+    ears      within 45 mm of the usual places of the ears, skin only
     head      everything above the plane y = -1.3, 130 mm below the ears' axis, with hair
     seen      the part of the head that the photo shows
     hidden    the rest of it: the sides, the back, what lies behind something else
@@ -49,7 +50,9 @@ from studies.portraits.visible_surface import (
     outer_surface,
 )
 
-REGIONS = ("face", "face_all", "head", "seen", "hidden")
+REGIONS = ("face", "face_all", "ears", "head", "seen", "hidden")
+EARS = ((-0.8, 0.0, -0.15), (0.8, 0.0, -0.15))  # scene units, in the subject's own frame
+EAR_RADIUS = 45.0  # mm
 DIRECTIONS = ("truth_to_prediction", "prediction_to_truth")
 
 
@@ -132,7 +135,9 @@ def score_geometry(
     `ALIGNMENT_REGION_DIRECTION_mean|median|p90|points` for all `ALIGNMENTS`, `REGIONS` and `DIRECTIONS`, where `points`
     counts the points measured (the others are NaN when there are none); `ALIGNMENT_REGION_mean`, the mean of both
     directions' means; `ALIGNMENT_scale` and `ALIGNMENT_turn` (degrees), of the map from prediction to truth, for the
-    cameras from camera to camera; `landmarks_used` of six and their root mean square distance `landmarks_rms`; and
+    cameras from camera to camera; `camera_distance_error`, percent by which the estimated camera is farther from the
+    landmarks than the true one, and `pose_error`, degrees between the face as it lies in the two cameras;
+    `landmarks_used` of six and their root mean square distance `landmarks_rms`; and
     the scores of `score_normals` and `silhouette_iou`, the latter where a head model can be: over the pixels of
     `fit.rays.find_modelled_pixels`. Raises InputError for a prediction that cannot be measured."""
     settings = settings or GeometrySettings()
@@ -163,6 +168,12 @@ def score_geometry(
     }
     offsets = np.linalg.norm(placed(predicted) - true, axis=1) * MILLIMETRES_PER_UNIT
     scores = {"landmarks_used": float(len(true)), "landmarks_rms": float(np.sqrt((offsets**2).mean()))}
+    away, true_away = (
+        np.linalg.norm(points.mean(axis=0) - camera.centre)
+        for points, camera in ((predicted, prediction.camera), (true, truth.camera))
+    )
+    scores["camera_distance_error"] = float(100 * (away / true_away - 1))
+    scores["pose_error"] = _angle(maps["camera"].rotation @ maps["h3ds"].rotation.T)
     for name, map in maps.items():
         scores[f"{name}_scale"] = map.scale
         scores[f"{name}_turn"] = _angle(map.rotation)
@@ -217,10 +228,12 @@ def _own_points(truth, surface):
 def _regions(truth, surface, points, nearest, nearest_face) -> dict[str, np.ndarray]:
     """Which points [P, 3] belong to each region, given their nearest points on the truth and these points' faces."""
     head = points[:, 1] > SHOULDERS
+    to_ear = np.linalg.norm(points[:, None] - np.array(EARS), axis=2).min(axis=1)
     near = head & (np.linalg.norm(points - surface.nose, axis=1) * MILLIMETRES_PER_UNIT < FACE_RADIUS)
+    ears = (to_ear * MILLIMETRES_PER_UNIT < EAR_RADIUS) & (surface.face_region[nearest_face] == SKIN)
     bare = np.isin(surface.face_region[nearest_face], (SKIN, EYE))
     seen = is_seen_by_camera(surface.outer.scene, truth.camera, nearest, surface.outer.normals[nearest_face])
-    return dict(zip(REGIONS, (near & bare, near, head, head & seen, head & ~seen), strict=True))
+    return dict(zip(REGIONS, (near & bare, near, ears, head, head & seen, head & ~seen), strict=True))
 
 
 def _distances(name, predicted, own_distance, own, truth, surface) -> dict[str, float]:
