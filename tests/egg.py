@@ -1,12 +1,15 @@
 """An egg with a nose: a head whose truth is known, and the camera that looks at it."""
 
+import dataclasses
+import json
+
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from sira_mi.portrait.camera import Camera
 from studies.portraits.alignment import SIX_LANDMARKS
-from studies.portraits.truth import Truth
+from studies.portraits.truth import VIEWS, Truth
 from studies.portraits.visible_surface import mesh_images
 
 SKIN, HAIR, CLOTH, NOTHING = 0, 1, 3, 255
@@ -65,3 +68,30 @@ def truth_of(vertices, faces, face_region=None, landmarks=None, camera=None) -> 
         face_region=np.zeros(len(faces), np.uint8) if face_region is None else face_region,
         landmarks=landmarks_on(vertices) if landmarks is None else landmarks,
     )
+
+
+def write_truth(path, truth: Truth, **changes):
+    """Writes `truth.npz`; an array is left out for None."""
+    arrays = {field.name: getattr(truth, field.name) for field in dataclasses.fields(truth) if field.name != "camera"}
+    arrays |= {"K": truth.camera.K, "world_to_camera": truth.camera.world_to_camera}
+    arrays["landmarks_valid"] = np.isfinite(truth.landmarks).all(axis=1)
+    arrays["landmarks"] = np.nan_to_num(truth.landmarks).astype(np.float32)
+    arrays["faces"] = truth.faces.astype(np.int32)
+    arrays |= changes
+    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    return path
+
+
+def write_views(folder, truth: Truth, **changes):
+    """Writes the views of a portrait, all like its photo at half the radiance; an array is left out for None."""
+    one = {
+        "image": (0.5 * truth.image).astype(np.float16),
+        "mask": (255 * truth.mask).astype(np.uint8),
+        "region": truth.region,
+        "face": truth.region == SKIN,
+    }
+    arrays = {f"{view}_{name}": array for view in VIEWS for name, array in one.items()} | changes
+    folder.mkdir(exist_ok=True)
+    np.savez(folder / "views.npz", **{name: array for name, array in arrays.items() if array is not None})
+    (folder / "portrait.json").write_text(json.dumps({"key": "", "entry": {"relights": ["noon", "lamp"]}}))
+    return folder

@@ -1,15 +1,14 @@
 """Files of a portrait's truth read back as written, and errors name what is wrong with one."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
-from egg import SIZE, head_like, truth_of
+from egg import SIZE, head_like, truth_of, write_truth, write_views
 
 from sira_mi.errors import InputError
 from studies.portraits.relit_lights import exposure_of
-from studies.portraits.truth import VIEWS, Truth, load_truth, load_views
+from studies.portraits.truth import Truth, load_truth, load_views
 
 
 @pytest.fixture(scope="module")
@@ -17,19 +16,8 @@ def truth() -> Truth:
     return truth_of(*head_like())
 
 
-def write(path, truth: Truth, **changes):
-    arrays = {field.name: getattr(truth, field.name) for field in dataclasses.fields(truth) if field.name != "camera"}
-    arrays |= {"K": truth.camera.K, "world_to_camera": truth.camera.world_to_camera}
-    arrays["landmarks_valid"] = np.isfinite(truth.landmarks).all(axis=1)
-    arrays["landmarks"] = np.nan_to_num(truth.landmarks).astype(np.float32)
-    arrays["faces"] = truth.faces.astype(np.int32)
-    arrays |= changes
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-    return path
-
-
 def test_a_truth_is_read_as_it_was_written(truth, tmp_path):
-    read = load_truth(write(tmp_path / "truth.npz", truth))
+    read = load_truth(write_truth(tmp_path / "truth.npz", truth))
     for field in dataclasses.fields(truth):
         if field.name != "camera":
             np.testing.assert_allclose(getattr(read, field.name), getattr(truth, field.name), rtol=1e-6)
@@ -54,7 +42,7 @@ def test_a_truth_is_read_as_it_was_written(truth, tmp_path):
 )
 def test_a_broken_truth_is_named(truth, tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
-        load_truth(write(tmp_path / "truth.npz", truth, **changes))
+        load_truth(write_truth(tmp_path / "truth.npz", truth, **changes))
 
 
 def test_a_file_that_is_no_truth_is_refused(tmp_path):
@@ -64,25 +52,8 @@ def test_a_file_that_is_no_truth_is_refused(tmp_path):
             load_truth(path)
 
 
-def write_views(folder, **changes):
-    """The views of a portrait whose head is a square; an array is left out for None."""
-    mask = np.zeros((4, 6), np.uint8)
-    mask[1:3, 2:5] = 255
-    one = {
-        "image": np.repeat(mask[..., None] / 510, 3, axis=2).astype(np.float16),
-        "mask": mask,
-        "region": np.where(mask > 0, 0, 255).astype(np.uint8),
-        "face": mask > 0,
-    }
-    arrays = {f"{view}_{name}": array for view in VIEWS for name, array in one.items()} | changes
-    folder.mkdir(exist_ok=True)
-    np.savez(folder / "views.npz", **{name: array for name, array in arrays.items() if array is not None})
-    (folder / "portrait.json").write_text(json.dumps({"key": "", "entry": {"relights": ["noon", "lamp"]}}))
-    return folder
-
-
-def test_views_are_read_with_their_light_and_turn(tmp_path):
-    views = load_views(write_views(tmp_path))
+def test_views_are_read_with_their_light_and_turn(truth, tmp_path):
+    views = load_views(write_views(tmp_path, truth))
     assert {name: (view.light, view.yaw) for name, view in views.items()} == {
         "relit_1": ("noon", 0),
         "relit_2": ("lamp", 0),
@@ -90,8 +61,10 @@ def test_views_are_read_with_their_light_and_turn(tmp_path):
         "turned_right": ("noon", -30),
     }
     view = views["relit_2"]
-    assert view.image.shape == (4, 6, 3) and view.image.dtype == view.mask.dtype == np.float32
-    assert view.mask.max() == 1 and view.image[1, 2, 0] == 0.5 and view.face.sum() == 6
+    assert view.image.shape == (SIZE, SIZE, 3) and view.image.dtype == view.mask.dtype == np.float32
+    np.testing.assert_allclose(view.image, 0.5 * truth.image, rtol=1e-3, atol=1e-6)
+    np.testing.assert_array_equal(view.mask, truth.mask)
+    np.testing.assert_array_equal(view.face, truth.region == 0)
 
 
 @pytest.mark.parametrize(
@@ -99,15 +72,15 @@ def test_views_are_read_with_their_light_and_turn(tmp_path):
     [
         ({"turned_left_face": None}, "holds no views of a portrait: .*turned_left_face"),
         ({"relit_1_mask": np.zeros(4, np.uint8)}, "relit_1_mask must be an image"),
-        ({"relit_2_region": np.zeros((6, 4), np.uint8)}, r"relit_2_region must be numbers \[4, 6\]"),
-        ({"turned_right_image": np.full((4, 6, 3), np.nan)}, "turned_right_image contains NaN"),
-        ({"relit_1_image": np.full((4, 6, 3), -1.0)}, "relit_1_image must not be negative"),
-        ({"relit_1_mask": np.ones((4, 6))}, "relit_1_mask must be of type u1, not float64"),
+        ({"relit_2_region": np.zeros((6, 4), np.uint8)}, r"relit_2_region must be numbers \[64, 64\]"),
+        ({"turned_right_image": np.full((SIZE, SIZE, 3), np.nan)}, "turned_right_image contains NaN"),
+        ({"relit_1_image": np.full((SIZE, SIZE, 3), -1.0)}, "relit_1_image must not be negative"),
+        ({"relit_1_mask": np.ones((SIZE, SIZE))}, "relit_1_mask must be of type u1, not float64"),
     ],
 )
-def test_broken_views_are_named(tmp_path, changes, message):
+def test_broken_views_are_named(truth, tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
-        load_views(write_views(tmp_path, **changes))
+        load_views(write_views(tmp_path, truth, **changes))
 
 
 def test_a_folder_without_views_is_refused(tmp_path):

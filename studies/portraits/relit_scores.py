@@ -43,7 +43,7 @@ def score_view(
     scores = {
         "psnr": psnr(shown[inside], true[inside]),
         "ssim": _average(similarity, inside),
-        "flip": flip(*(np.where(inside[..., None], image, 0) for image in (picture, truth)), inside),
+        "flip": flip(np.where(inside[..., None], picture, 0), np.where(inside[..., None], truth, 0), inside),
         "scaled_psnr": psnr(linear_to_srgb(scale * picture[inside]), true[inside]),
         "scale": scale,
     }
