@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sira_mi.errors import InputError
-from studies.portraits.methods import BY_NAME
-from studies.portraits.summary import SHIPPED
+from studies.portraits.methods import BY_NAME, SHIPPED
 
 # Scores: millimetres between the faces, decibels of the re-render.
 MILLIMETRES, DECIBELS = "h3ds_face_mean", "final_psnr"

@@ -1,16 +1,16 @@
-"""`python -m studies.portraits build|fit|page|skin|landmarks …`: portraits of known heads, and how close fits come.
+"""`python -m studies.portraits build|fit|page|stranger|skin|landmarks …`: portraits of known heads, and fits to them.
 
-`build` renders portraits of the collection's test heads under known light; it resumes. `fit` fits and scores them and
-writes the figures, `docs/data/portraits.json`, the picture and the page, `docs/results.md`; `page` writes the page from
-the figures alone. `skin` and `landmarks` use portraits of training heads: `skin` measures how the radiance of skin and
-eyes predicts the skin's albedo, the values of `sira_mi.fit.skin`; `landmarks` measures the errors of detected landmarks
-and of the prior's landmarks, and writes the corrections of both.
+`build` renders portraits of the collection's test heads under known light; it resumes. `fit` fits and scores them;
+`page` writes the page, `docs/results.md`, from its figures. `stranger` writes a sheet of relit heads and photos that a
+stranger pairs blindly, and its key. `skin` and `landmarks` use portraits of training heads: `skin` measures how the
+radiance of skin and eyes predicts the skin's albedo, the values of `sira_mi.fit.skin`; `landmarks` measures the errors
+of detected landmarks and of the prior's landmarks, and writes the corrections of both.
 """
 
 from sira_mi.errors import CommandParser, run_command
-from studies.portraits.commands import build, fit, landmarks, page, skin
+from studies.portraits.commands import build, fit, landmarks, page, skin, stranger
 
-COMMANDS = {"build": build, "fit": fit, "page": page, "skin": skin, "landmarks": landmarks}
+COMMANDS = {"build": build, "fit": fit, "page": page, "stranger": stranger, "skin": skin, "landmarks": landmarks}
 
 
 def main() -> None:

@@ -149,3 +149,4 @@ METHODS = (
     Method("b.7", "as b.3, all of the residual to the albedo", _all_to_the_albedo, _unchanged, after="a.4"),
 )
 BY_NAME = {method.name: method for method in METHODS}
+SHIPPED = "b.3"  # the fit as it ships

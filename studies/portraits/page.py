@@ -1,209 +1,251 @@
-"""`docs/results.md`: `template.md` with the figures of `docs/data/portraits.json` filled in."""
+"""`docs/results.md`: `template.md` with the figures of `docs/data/foreign.json` and `docs/data/own.json` filled in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 from typing import Any
 
+from sira_mi.errors import InputError
 from sira_mi.files import write_text
+from studies.data import read_figures
 from studies.markdown import number, table
+from studies.portraits.relit_scores import SHARES
 
-FIGURES = Path("data") / "portraits.json"  # beside the page
+FIGURES = {kind: Path("data") / f"{kind}.json" for kind in ("foreign", "own")}  # beside the page
+PICTURES = {"rows": Path("images") / "results.jpg", "worst": Path("images") / "results_worst.jpg"}
 TEMPLATE = Path(__file__).with_name("template.md")
-AT_MOST, AT_LEAST = "≤", "≥"
+NOTES = ("ladder", "stranger")  # parts of the figures of `foreign` that are given, not measured by the page
+NOT_MEASURED = "Not measured yet."
 
 
 @dataclass(frozen=True)
 class Column:
-    """One score of a table."""
+    """One score of a table: its value at a path of keys in a row's figures."""
 
     title: str
-    score: str
+    path: tuple[str, ...]
     digits: int = 2
+    factor: float = 1.0
 
 
-GEOMETRY_COLUMNS = (
-    Column("face", "h3ds_face_mean"),
-    Column("no ICP", "camera_face_mean"),
-    Column("head", "h3ds_head_mean"),
-    Column("hidden half", "h3ds_hidden_mean"),
-    Column("normals, °", "normals_mean", 1),
-    Column("IoU", "silhouette_iou", 3),
+def _scores(statistic: str, *columns: tuple) -> tuple[Column, ...]:
+    return tuple(Column(title, (statistic, score), *digits) for title, score, *digits in columns)
+
+
+HEADLINE = _scores(
+    "mean",
+    ("relit, dB", "relit_psnr", 1),
+    ("SSIM", "relit_ssim", 3),
+    ("ꟻLIP", "relit_flip", 3),
+    ("scaled, dB", "relit_scaled_psnr", 1),
+    ("turned, dB", "turned_psnr", 1),
+    ("SSIM", "turned_ssim", 3),
+    ("ꟻLIP", "turned_flip", 3),
+    ("scaled, dB", "turned_scaled_psnr", 1),
 )
-LIGHT_COLUMNS = (
-    Column("face, mm", "h3ds_face_mean"),
-    Column("final, dB", "final_psnr", 1),
-    Column("eq. 8, dB", "shaded_psnr", 1),
-    Column("diffuse, dB", "diffuse_psnr", 1),
-    Column("specular, dB", "specular_psnr", 1),
+TAILS = tuple(
+    column
+    for title, statistic in (("worst", "worst"), ("darkest fifth", "darkest"))
+    for column in _scores(
+        statistic,
+        (f"{title}: relit, dB", "relit_psnr", 1),
+        ("SSIM", "relit_ssim", 3),
+        ("scaled, dB", "relit_scaled_psnr", 1),
+        ("turned, dB", "turned_psnr", 1),
+    )
 )
-ABLATION_COLUMNS = (
-    Column("final, dB", "final_psnr", 1),
-    Column("eq. 8, dB", "shaded_psnr", 1),
-    Column("diffuse, dB", "diffuse_psnr", 1),
-    Column("scaled, dB", "diffuse_scaled_psnr", 1),
-    Column("leakage", "leakage_shading"),
+PARTS = _scores(
+    "mean",
+    *(
+        column
+        for title, part in (("face", "face"), ("hair", "hair"), ("clothes", "cloth"))
+        for column in ((f"{title}, dB", f"relit_{part}_psnr", 1), ("SSIM", f"relit_{part}_ssim", 3))
+    ),
 )
+SHARE_TITLES = {"skin": "other skin", "cloth": "clothes"}
+SHARE_COLUMNS = (
+    *(Column(SHARE_TITLES.get(name, name), ("mean", f"relit_share_{name}"), 0, 100) for name in SHARES),
+    Column("spill", ("mean", "relit_spill"), 0, 100),
+)
+GEOMETRY = (
+    *_scores(
+        "mean",
+        ("face", "h3ds_face_mean"),
+        ("there", "h3ds_face_truth_to_prediction_mean"),
+        ("back", "h3ds_face_prediction_to_truth_mean"),
+        ("over mean head", "over_mean_head"),
+    ),
+    Column("worst", ("worst", "over_mean_head")),
+    Column("above 1, %", ("mean", "above_mean_head"), 0, 100),
+    *_scores(
+        "mean",
+        ("ears", "h3ds_ears_mean"),
+        ("head", "h3ds_head_mean"),
+        ("frame", "camera_face_mean"),
+        ("normals, °", "normals_mean", 1),
+        ("pose, °", "pose_error", 1),
+        ("camera, %", "camera_distance_error_size", 0),
+        ("IoU", "silhouette_iou", 3),
+    ),
+)
+APPEARANCE = (
+    *_scores(
+        "mean",
+        ("albedo, dB", "diffuse_psnr", 1),
+        ("SSIM", "diffuse_ssim", 3),
+        ("scaled, dB", "diffuse_scaled_psnr", 1),
+        ("bias", "tone_bias"),
+        ("its size", "tone_bias_size"),
+    ),
+    *(Column(f"ITA, {tone}", ("by", "tone", tone, "tone_ita_error"), 0) for tone in ("dark", "medium", "light")),
+    *_scores(
+        "mean",
+        ("specular, dB", "specular_gain", 1),
+        ("leakage", "leakage_shading"),
+        ("final, dB", "final_psnr", 1),
+        ("SSIM", "final_ssim", 3),
+        ("eq. 8, dB", "shaded_psnr", 1),
+    ),
+)
+OWN = _scores(
+    "mean",
+    ("relit, dB", "relit_psnr", 1),
+    ("SSIM", "relit_ssim", 3),
+    ("turned, dB", "turned_psnr", 1),
+    ("face, mm", "h3ds_face_mean"),
+    ("over mean head", "over_mean_head"),
+    ("head, mm", "h3ds_head_mean"),
+    ("normals, °", "normals_mean", 1),
+    ("IoU", "silhouette_iou", 3),
+    ("albedo, dB", "diffuse_psnr", 1),
+    ("final, dB", "final_psnr", 1),
+    ("eq. 8, dB", "shaded_psnr", 1),
+)
+COSTS = (
+    Column("fit, s", ("cpu_seconds",), 0),
+    Column("pictures, s", ("relight_cpu_seconds",), 0),
+    Column("memory, GB", ("peak_memory_megabytes",), 1, 1e-3),
+)
+LADDER = {"psnr": ("relit, dB", 1), "ssim": ("SSIM", 3), "face": ("face, mm", 2), "delta": ("change, dB", 1)}
 
 
-@dataclass(frozen=True)
-class Mark:
-    """A bound that the shipped fit has to meet."""
-
-    title: str
-    sign: str  # AT_MOST or AT_LEAST
-    limit: float
-    value: Callable[[dict], float | None]  # of the figures
-    digits: int = 2
-
-    def is_met(self, value: float) -> bool:
-        return value <= self.limit if self.sign == AT_MOST else value >= self.limit
-
-
-def find(figures: dict, *path: str) -> Any:
+def find(figures: Mapping, *path: str) -> Any:
     """The value at a path of keys; None where a key is missing."""
     value: Any = figures
     for key in path:
-        if key not in value:
+        if not isinstance(value, Mapping) or key not in value:
             return None
         value = value[key]
     return value
 
 
-def _of_fit(group: str, score: str) -> Callable[[dict], float | None]:
-    return lambda figures: find(figures, "shipped", "methods", figures["roles"]["shipped"], group, score)
-
-
-def _over_mean_head(figures: dict) -> float | None:
-    fit, mean = (
-        find(figures, "shipped", "methods", figures["roles"][role], "geometry", "h3ds_face_mean")
-        for role in ("shipped", "baseline")
-    )
-    return None if fit is None or mean is None else fit / mean
-
-
-def _gain_over_ablations(figures: dict) -> float | None:
-    """Of the fit's geometry over the best of the methods before it."""
-    methods = figures["ablations"]["methods"]
-    found = {name: find(methods, name, "geometry", "h3ds_face_mean") for name in methods if name.startswith("a.")}
-    own = found.pop(figures["roles"]["geometry"], None)
-    others = [value for value in found.values() if value is not None]
-    return None if own is None or not others else own - min(others)
-
-
-def _draft_face(figures: dict) -> float | None:
-    """Of the shipped method, or of its geometry stages where nothing after them moves the shape."""
-    methods, shipped = figures["ablations"]["methods"], figures["roles"]["shipped"]
-    if shipped not in methods:
-        return None
-    last = shipped if "geometry" in methods[shipped] else figures["roles"]["geometry"]
-    return find(methods, last, "geometry", "h3ds_face_mean")
-
-
-def _gigabytes(figures: dict) -> float | None:
-    megabytes = find(figures, "shipped", "fit_megabytes")
-    return None if megabytes is None else megabytes / 1000
-
-
-MARKS = (
-    Mark("face, mm", AT_MOST, 1.0, _of_fit("geometry", "h3ds_face_mean")),
-    Mark("over the mean head's", AT_MOST, 0.7, _over_mean_head),
-    Mark("face, no ICP, mm", AT_MOST, 1.5, _of_fit("geometry", "camera_face_mean")),
-    Mark("face normals, °", AT_MOST, 8, _of_fit("geometry", "normals_mean"), 1),
-    Mark("geometry minus best ablation, mm", AT_MOST, 0, _gain_over_ablations),
-    Mark("silhouette IoU", AT_LEAST, 0.97, _of_fit("geometry", "silhouette_iou"), 3),
-    Mark("final render, dB", AT_LEAST, 34, _of_fit("appearance", "final_psnr"), 1),
-    Mark("final render, SSIM", AT_LEAST, 0.95, _of_fit("appearance", "final_ssim"), 3),
-    Mark("eq. 8 alone, dB", AT_LEAST, 34, _of_fit("appearance", "shaded_psnr"), 1),
-    Mark("diffuse albedo, dB", AT_LEAST, 23, _of_fit("appearance", "diffuse_psnr"), 1),
-    Mark("diffuse albedo, SSIM", AT_LEAST, 0.88, _of_fit("appearance", "diffuse_ssim"), 3),
-    Mark("specular albedo, dB", AT_LEAST, 19.5, _of_fit("appearance", "specular_psnr"), 1),
-    Mark("specular albedo, SSIM", AT_LEAST, 0.71, _of_fit("appearance", "specular_ssim"), 3),
-    Mark("fit, s", AT_MOST, 300, lambda figures: find(figures, "shipped", "fit_seconds"), 0),
-    Mark("peak memory, GB", AT_MOST, 2, _gigabytes, 1),
-    Mark("draft, s", AT_MOST, 60, lambda figures: find(figures, "ablations", "fit_seconds"), 1),
-    Mark("face of a draft, mm", AT_MOST, 1.2, _draft_face),
-)
-
-
-def write_page(figures: dict, out: Path) -> Path:
-    """Writes `out/results.md`; returns its path."""
-    write_text(out / "results.md", render_page(figures))
+def write_page(out: Path) -> Path:
+    """Writes `out/results.md` from the figures beside it, of which one may be missing; returns its path."""
+    figures = {kind: read_figures(out / path) for kind, path in FIGURES.items() if (out / path).exists()}
+    if not figures:
+        raise InputError(f"{out} has no figures of a study; give --benchmark and --runs to measure them")
+    write_text(out / "results.md", render_page(figures.get("foreign"), figures.get("own")))
     return out / "results.md"
 
 
-def render_page(figures: dict) -> str:
-    """The page's Markdown."""
-    shipped, ablations = figures["shipped"], figures["ablations"]
+def render_page(foreign: dict | None, own: dict | None) -> str:
+    """The page's Markdown from the figures of both benchmarks; None for one that is not measured."""
+    shown = foreign or {"portraits": 0, "identities": 0, "rows": {}, "groups": {}, "failed": [], "measured": {}}
+    rows = shown["rows"]
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        portraits=figures["portraits"],
-        revision=figures["measured"]["revision"],
-        date=figures["measured"]["date"],
-        quality=shipped["quality"],
-        ablation_quality=ablations["quality"],
-        geometry_method=figures["roles"]["geometry"],
-        shipped_method=figures["roles"]["shipped"],
-        marks=_marks(figures),
-        geometry=table(
-            ("", "quality", *(c.title for c in GEOMETRY_COLUMNS)),
-            [
-                *_geometry_rows(shipped),
-                *(row for row in _geometry_rows(ablations) if row[0] != figures["roles"]["baseline"]),
-            ],
-        ),
-        lights=_lights(figures),
-        ablations=table(
-            ("", *(c.title for c in ABLATION_COLUMNS), "s"),
-            [
-                [f"{name} {method['title']}", *_cells(method["appearance"], ABLATION_COLUMNS), _seconds(method)]
-                for name, method in ablations["methods"].items()
-                if "appearance" in method
-            ],
-        ),
-        failed=_failed(figures["failed"]),
+        what=_describe(shown),
+        revision=find(shown, "measured", "revision") or "–",
+        date=find(shown, "measured", "date") or "–",
+        headline=_table(rows, HEADLINE),
+        tails=_table(rows, TAILS),
+        parts=_table(rows, PARTS),
+        shares=_table(rows, SHARE_COLUMNS),
+        groups_psnr=_groups(shown, "relit_psnr", 1),
+        groups_ssim=_groups(shown, "relit_ssim", 3),
+        groups_face=_groups(shown, "h3ds_face_mean", 2),
+        geometry=_table(rows, GEOMETRY),
+        appearance=_table(rows, APPEARANCE),
+        ladder=_ladder(shown.get("ladder", [])) + _strangers(shown.get("stranger", [])),
+        cost=_table(rows, COSTS),
+        own=_own(own),
+        failed=_failed([*shown["failed"], *(own["failed"] if own else [])]),
+        pictures=_pictures(shown.get("pictures", {})),
     )
 
 
-def _cells(scores: dict, columns: Sequence[Column]) -> list[str]:
-    return [number(scores.get(c.score), c.digits) for c in columns]
+def _describe(figures: Mapping) -> str:
+    return (
+        f"{figures['portraits']} portraits of {figures['identities']} people ([benchmark](benchmark.md)): heads from "
+        "elsewhere, which\nnothing in the fit has seen, the half of them on which no setting was chosen."
+    )
 
 
-def _seconds(method: dict) -> str:
-    return number(method.get("seconds"), 0)
-
-
-def _marks(figures: dict) -> str:
+def _table(rows: Mapping[str, dict], columns: Sequence[Column]) -> str:
+    """A line for each row that has one of the columns."""
     lines = []
-    for mark in MARKS:
-        value = mark.value(figures)
-        verdict = "–" if value is None else "met" if mark.is_met(value) else "**missed**"
-        lines.append([mark.title, f"{mark.sign}{mark.limit:g}", number(value, mark.digits), verdict])
-    return table(("", "wanted", "measured", ""), lines)
+    for row in rows.values():
+        values = [find(row, *column.path) for column in columns]
+        if any(value is not None for value in values):
+            cells = (
+                number(None if value is None else column.factor * value, column.digits)
+                for column, value in zip(columns, values, strict=True)
+            )
+            lines.append([row["title"], str(row["count"]), *cells])
+    return table(("", "n", *(column.title for column in columns)), lines) if lines else NOT_MEASURED
 
 
-def _geometry_rows(quality: dict) -> list[list[str]]:
-    return [
-        [f"{name} {method['title']}".strip(), quality["quality"], *_cells(method["geometry"], GEOMETRY_COLUMNS)]
-        for name, method in quality["methods"].items()
-        if "geometry" in method
-    ]
+def _groups(figures: Mapping, score: str, digits: int) -> str:
+    titles = {
+        (kind, name): f"{name} ({count})" for kind, names in figures["groups"].items() for name, count in names.items()
+    }
+    columns = [Column(title, ("by", *group, score), digits) for group, title in titles.items()]
+    return _table(figures["rows"], columns)
 
 
-def _lights(figures: dict) -> str:
-    """Rows of the shipped fit: all portraits, each light, and the smallest and largest value over portraits."""
-    fit = find(figures, "shipped", "methods", figures["roles"]["shipped"]) or {}
-    everywhere = {**fit.get("geometry", {}), **fit.get("appearance", {})}
-    lines = [["all", *_cells(everywhere, LIGHT_COLUMNS)]]
-    lines += [[light, *_cells(scores, LIGHT_COLUMNS)] for light, scores in figures["lights"].items()]
-    for title, choose in (("smallest", min), ("largest", max)):
-        known = {c.score: [v for row in figures["each"] if (v := row.get(c.score)) is not None] for c in LIGHT_COLUMNS}
-        lines.append([title, *_cells({s: choose(v) for s, v in known.items() if v}, LIGHT_COLUMNS)])
-    return table(("light", *(c.title for c in LIGHT_COLUMNS)), lines)
+def _own(own: dict | None) -> str:
+    if own is None:
+        return NOT_MEASURED
+    measured = own["measured"]
+    return (
+        f"{own['portraits']} portraits, measured at revision `{measured['revision']}` on {measured['date']}: "
+        f"[data/own.json](data/own.json).\n\n{_table(own['rows'], OWN)}"
+    )
 
 
-def _failed(failed: Sequence[dict]) -> str:
+def _ladder(steps: Sequence[Mapping]) -> str:
+    """Dicts of `name` and the keys of `LADDER`."""
+    if not steps:
+        return ""
+    lines = [[step["name"], *(number(step.get(key), digits) for key, (_, digits) in LADDER.items())] for step in steps]
+    return (
+        "\n## The ladder\n\n"
+        + table(("", *(title for title, _ in LADDER.values())), lines)
+        + "\n\nOne estimated thing at a time replaced by its truth, then all: what each is worth, and the ceiling.\n"
+    )
+
+
+def _strangers(tests: Sequence[Mapping]) -> str:
+    """Dicts of `title` of the row, `by` whom, how many were `right` `of` how many."""
+    if not tests:
+        return ""
+    lines = [[test["title"], test["by"], f"{test['right']} of {test['of']}"] for test in tests]
+    return (
+        "\n## The stranger's test\n\n"
+        + table(("", "paired by", "right"), lines)
+        + "\n\nRelit and turned heads, paired blindly with photos: `python -m studies.portraits stranger`.\n"
+    )
+
+
+def _failed(failed: Sequence[Mapping]) -> str:
     if not failed:
         return ""
-    lines = [[row["portrait"], row["method"], row["error"]] for row in failed]
-    return "\n## Fits that failed\n\n" + table(("portrait", "method", "error"), lines) + "\n"
+    lines = [[row["portrait"], row["row"], row["error"]] for row in failed]
+    return "\n## What failed\n\n" + table(("portrait", "row", "error"), lines) + "\n"
+
+
+def _pictures(pictures: Mapping) -> str:
+    """`rows` describes the sheet of all rows, `worst` that of the worst portraits."""
+    titles = {"rows": "Some portraits in all rows", "worst": "The worst portraits"}
+    lines = [f"{pictures[name]}\n\n![{titles[name]}]({path})\n" for name, path in PICTURES.items() if name in pictures]
+    return "\n## Pictures\n\n" + "\n".join(lines) if lines else ""

@@ -1,17 +1,14 @@
-"""fit the benchmark's portraits, score them, write figures and page"""
+"""fit the benchmark's portraits and score them"""
 
 import argparse
 from pathlib import Path
 
 from studies.cache import write_json
-from studies.data import write_figures
-from studies.portraits.commands import page
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--benchmark", type=Path, required=True)
     parser.add_argument("--runs", type=Path, required=True, help="folder of the fits; finished ones are kept")
-    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder of the page (default: docs)")
     parser.add_argument(
         "--quality", choices=("draft", "standard", "high"), default="standard", help="of the shipped fit"
     )
@@ -28,18 +25,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Fits and scores the benchmark's portraits as the command line says; writes figures, picture and page."""
+    """Fits and scores the benchmark's portraits as the command line says, into RUNS/QUALITY/rows.json."""
     from sira_mi.avatar.file import PRIOR
     from sira_mi.variants import set_variant
     from studies.portraits.compare_methods import Comparison, compare
-    from studies.portraits.methods import BY_NAME
-    from studies.portraits.page import FIGURES
-    from studies.portraits.picture import write_picture
-    from studies.portraits.summary import SHIPPED, summarise
+    from studies.portraits.methods import BY_NAME, SHIPPED
 
     set_variant(arguments.variant)
 
-    def rows(quality: str, methods: tuple[str, ...]) -> list[dict]:
+    def write_rows(quality: str, methods: tuple[str, ...]) -> None:
         comparison = Comparison(
             arguments.benchmark,
             arguments.runs / quality,
@@ -50,14 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
             only=tuple(arguments.portraits),
             variant=arguments.variant,
         )
-        found = compare(comparison)
-        write_json(arguments.runs / quality / "rows.json", found)
-        return found
+        write_json(arguments.runs / quality / "rows.json", compare(comparison))
 
-    ablations = rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
-    shipped = rows(arguments.quality, (SHIPPED,))
-    figures = summarise(shipped, ablations, arguments.quality, arguments.ablations)
-    write_figures(arguments.out / FIGURES, figures)
-    picture = arguments.out / "images" / "results.png"
-    write_picture(shipped, arguments.benchmark, arguments.runs / arguments.quality, picture)
-    page.run(arguments)
+    write_rows(arguments.ablations, tuple(arguments.methods or BY_NAME))
+    write_rows(arguments.quality, (SHIPPED,))
