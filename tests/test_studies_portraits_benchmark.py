@@ -15,26 +15,30 @@ import trimesh
 from sira_mi.colour import linear_to_srgb
 from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
-from sira_mi.portrait.camera import convert_exif_focal
+from sira_mi.files import write_exr
+from sira_mi.portrait.camera import Camera, convert_exif_focal, yaw_rotation
 from sira_mi.portrait.load import load_photo
 from sira_mi.training.collection import skin
 from sira_mi.training.collection.lighting import map_directions, render_lobes
 from sira_mi.training.collection.render import Part, RenderSettings, build_scene, project, render_views
+from sira_mi.training.collection.similarity import Similarity
 from sira_mi.training.collection.sources.makehuman import MakeHumanSource
 from studies.portraits import benchmark
 from studies.portraits.benchmark_lights import HARD, LIGHTS, _lobe, light_map, look_up
-from studies.portraits.benchmark_photo import PhotoSettings, View, level_parts, portrait_camera
+from studies.portraits.benchmark_photo import PhotoSettings, Pose, View, find_focal, level_parts, portrait_camera
 from studies.portraits.benchmark_plan import (
     BenchmarkSettings,
     Identity,
     choose_identities,
     heads_of,
     plan,
+    plan_own,
+    rebuild_subject,
     select_sources,
 )
-from studies.portraits.truth import load_truth
+from studies.portraits.truth import VIEWS, load_truth, load_views
 
-TINY = PhotoSettings(size=48, samples=16, depth=3, shading_samples=64)
+TINY = PhotoSettings(size=48, samples=16, view_samples=4, depth=3, shading_samples=64)
 EVEN = {code: 0.5 for code in range(4)}
 NUMBER, SEED = 7, 4711
 
@@ -61,7 +65,7 @@ def sphere():
 
 
 def view_of(parts: list[Part], roughness=EVEN, settings=TINY) -> View:
-    return View(parts, roughness, *portrait_camera(parts, 20, 10, 60, 4.0, settings.size), settings)
+    return View(parts, roughness, *portrait_camera(parts, Pose(20, 10, 60, 4.0), settings.size), settings)
 
 
 def identities() -> list[Identity]:
@@ -98,11 +102,21 @@ def test_heads_are_chosen_by_a_rule_from_all_sources():
     assert len(choose_identities(heads[-5:], 12, 0)) == 5
 
 
-def test_the_plan_spreads_poses_and_lights():
+@pytest.fixture(scope="module")
+def environments(tmp_path_factory) -> list[Path]:
+    """Four environment maps: two even ones, and two with a lamp."""
+    folder = tmp_path_factory.mktemp("hdri")
+    for number in range(4):
+        lobes = [_lobe(0, 90, 0.3, np.ones(3)), _lobe(40 * number, 20, 50.0, np.full(3, 5.0 * (number > 1)))]
+        write_exr(folder / f"light{number}.exr", render_lobes(np.array(lobes), 16))
+    return sorted(folder.iterdir())
+
+
+def test_the_plan_spreads_poses_and_lights(environments):
     """Three lights of each head in one pose; yaws evenly in -40..40 overall and among the primary portraits of each
-    light; four primary portraits a light; no seed twice."""
+    light; four primary portraits a light; no seed twice. Each is relit under an even light and under a lamp, in turns
+    first, and never under its own environment."""
     heads = choose_identities(identities(), 12, 0)
-    environments = [Path(f"{k}.exr") for k in range(4)]
     shots = plan(heads, environments, BenchmarkSettings())
     assert all([shot.light for shot in mine] == list(LIGHTS) for mine in shots)
     assert all(len({shot.pose for shot in mine}) == 1 for mine in shots)
@@ -118,12 +132,18 @@ def test_the_plan_spreads_poses_and_lights():
     assert all(50 <= shot.pose.focal_35mm <= 85 and abs(shot.pose.pitch) <= 8 for shot in primary)
     only = plan(heads, environments, BenchmarkSettings(primary_only=True))
     assert [mine[0] for mine in only] == primary
+    for number, (shot, *_) in enumerate(shots):
+        first, second = (environments.index(path) for path in shot.relights)
+        assert shot.environment not in shot.relights and (first > 1) != (second > 1) and (first > 1) == number % 2
+    assert not any(mine[0].relights for mine in plan(heads, [], BenchmarkSettings(split="train")))
+    with pytest.raises(InputError, match="3 environment maps: relighting takes 4"):
+        plan(heads, environments[:3], BenchmarkSettings())
 
 
 def test_the_camera_has_the_focal_length_of_its_exif_tag_and_shows_the_hair(sphere):
     """The focal length in pixels is what the portrait front end reads from EXIF; the highest point is in the picture,
     and the head's middle in the middle column."""
-    K, pose = portrait_camera([sphere], -40, 8, 62.0, 4.6, 512)
+    K, pose = portrait_camera([sphere], Pose(-40, 8, 62.0, 4.6), 512)
     assert K[0, 0] == pytest.approx(convert_exif_focal(62.0, 512, 512), rel=1e-6)
     assert K[0, 2] == K[1, 2] == 256
     pixels, depth = project(np.array([[0, 1.2, 0], [0.0, 0, 0]]), K, pose)
@@ -131,6 +151,16 @@ def test_the_camera_has_the_focal_length_of_its_exif_tag_and_shows_the_hair(sphe
     assert (depth > 0).all()
     camera = -pose[:3, :3].T @ pose[:3, 3]
     assert np.degrees(np.arctan2(camera[0], camera[2])) == pytest.approx(-40, abs=0.01)
+
+
+def test_a_pose_says_distance_and_place_of_the_head(sphere):
+    """4 units away, with 3 across the photo and the middle 0.5 units right of and 0.2 above the head: the head is at
+    that depth, half of a third left of the middle, and below it."""
+    pose = Pose(0, 0, find_focal(4.0, 3.0), 3.0, height=0.2, aside=0.5)
+    assert pose.distance == pytest.approx(4)
+    pixels, depth = project(np.zeros((1, 3)), *portrait_camera([sphere], pose, 300))
+    assert depth[0] == pytest.approx(4)
+    np.testing.assert_allclose(pixels[0], [100, 170])
 
 
 def test_truth_of_a_sphere_under_even_light(sphere):
@@ -184,7 +214,7 @@ def test_shadow_of_an_occluder_under_a_hard_light():
     """A ball in front of a larger one under a small light behind the camera's shoulder: the umbra's pixels get nothing
     of the direct light, lit ones all of it, and both the photo and the shading are dark in the umbra."""
     parts = [ball(1.2, (0, 0, 0), (0.4, 0.4, 0.4), 0.3, 0), ball(0.3, (0.0, 0.6, 1.9), (0.4, 0.4, 0.4), 0.3, 1)]
-    view = View(parts, EVEN, *portrait_camera(parts, -35, 0, 60, 5.0, 96), replace(TINY, size=96))
+    view = View(parts, EVEN, *portrait_camera(parts, Pose(-35, 0, 60, 5.0), 96), replace(TINY, size=96))
     light = render_lobes(np.array([_lobe(0, 17.5, HARD, np.ones(3)), _lobe(0, 90, 0.3, np.full(3, 0.02))]))
     radiance, _ = view.photograph(light, 1)
     irradiance, shadow = view.shading(2)
@@ -198,6 +228,41 @@ def test_shadow_of_an_occluder_under_a_hard_light():
     np.testing.assert_allclose(irradiance[lit].mean(-1), (normal @ towards)[lit] / np.pi, rtol=0.2, atol=0.02)
     for image in (radiance, irradiance):
         assert image[umbra].mean() < 0.25 * image[lit].mean()
+
+
+def test_a_turned_view_is_that_of_a_turned_head():
+    """A ball with a nose and one dark side, turned by 30° to its left before the same camera under the same light: the
+    same picture, mask, regions and face as of parts that are turned by hand; places remain in the head's own frame."""
+    parts = [ball(1.2, (0, 0, 0), (0.4, 0.4, 0.4), 0.3, skin.SKIN), ball(0.4, (0.4, 0.3, 1.1), (0.1, 0.3, 0.6), 0.3, 1)]
+    turn = yaw_rotation(30)
+    by_hand = Similarity(1.0, turn, np.zeros(3)).move(parts)
+    camera, light = (
+        portrait_camera(parts, Pose(10, 5, 60, 4.0), 48),
+        render_lobes(np.array([_lobe(70, 20, 9.0, np.ones(3))])),
+    )
+    settings = replace(TINY, samples=256)
+    view, reference = (View(some, EVEN, *camera, settings) for some in (parts, by_hand))
+    turned = view.turn(30)
+    nose = np.array([0.4, 0.3, 1.5])
+    assert (turned.region == reference.region).all() and (turned.region != view.region).any()
+    np.testing.assert_allclose(turned.position @ turn.T, reference.position, atol=1e-4)
+    assert (benchmark.find_face(turned, nose) == benchmark.find_face(reference, turn @ nose)).all()
+    (radiance, mask), (wanted, wanted_mask) = turned.photograph(light, 1), reference.photograph(light, 1)
+    np.testing.assert_allclose(mask, wanted_mask, atol=0.02)
+    assert np.abs(radiance - wanted).mean() < 0.02 * wanted.mean()
+    assert np.abs(radiance - view.photograph(light, 1)[0]).mean() > 0.2 * wanted.mean()
+
+
+def test_a_grey_ball_under_an_even_environment_shines_by_its_albedo():
+    """Relit by the environment as it is: radiance L times about the albedo, whatever `principled` adds at the rim, and
+    half a map as bright is half as bright."""
+    grey = [ball(1.2, (0, 0, 0), (0.5, 0.5, 0.5), 0.0, skin.SKIN)]
+    view = view_of(grey, EVEN | {skin.SKIN: 1.0}, replace(TINY, samples=64))
+    radiance, mask = view.photograph(np.full((8, 16, 3), 2.0), 1)
+    inside = mask == 1
+    assert radiance[inside].mean() == pytest.approx(1.0, rel=0.1) and not radiance[mask == 0].any()
+    half, _ = view.photograph(np.full((8, 16, 3), 1.0), 1)
+    np.testing.assert_allclose(half, radiance / 2, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -330,12 +395,12 @@ def collection(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def built(collection, tmp_path_factory):
-    """The benchmark of the MakeHuman head, and its entries."""
+def built(collection, environments, tmp_path_factory):
+    """The benchmark of the MakeHuman head, its settings, sittings and entries."""
     folder = tmp_path_factory.mktemp("benchmark")
     settings = BenchmarkSettings(photo=replace(TINY, samples=4, shading_samples=4))
-    sources = (MakeHumanSource(8, None),)
-    return folder, settings, sources, benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
+    sittings = plan_own(collection, (MakeHumanSource(8, None),), environments[0].parent, settings)
+    return folder, settings, sittings, benchmark.build_benchmark(sittings, folder, settings, 1)
 
 
 @pytest.mark.slow
@@ -343,6 +408,11 @@ def test_a_benchmark_holds_photos_and_truth(built):
     """Three portraits with the files and arrays of the contract: the photo is the truth's image in sRGB, it carries its
     focal length, the truth passes the evaluation's own checks, and the head is in the picture."""
     folder, settings, _, entries = built
+    photos = folder / "photos"
+    names = [entry["name"] for entry in entries]
+    assert sorted(path.name for path in photos.iterdir()) == sorted(
+        [f"{name}.jpg" for name in names] + [f"{name}.camera.json" for name in names]
+    )
     assert benchmark.read_benchmark(folder) == entries
     with pytest.raises(InputError, match="shows test heads"):
         benchmark.read_benchmark(folder, "train")
@@ -351,15 +421,16 @@ def test_a_benchmark_holds_photos_and_truth(built):
     for entry in entries:
         assert entry["name"] == f"makehuman_0007_{entry['light']}" and entry["identity"] == "makehuman/0007"
         assert entry["clothes"] and not entry["hair"] and entry["clipped"] < 0.2
-        photo = load_photo(folder / entry["name"] / "photo.jpg")
+        truth_folder = folder / "truth" / entry["name"]
+        photo = load_photo(photos / f"{entry['name']}.jpg")
         assert photo.focal_35mm == round(entry["focal_35mm"])
-        with np.load(folder / entry["name"] / "truth.npz", allow_pickle=False) as data:
+        with np.load(truth_folder / "truth.npz", allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         assert list(arrays) == list(benchmark.TRUTH)
         for name, text in benchmark.TRUTH.items():
             kind = text.split("] ")[1].split(",")[0].split(" ")[0]
             assert arrays[name].dtype == {"f4": "f4", "u1": "u1", "i4": "i4", "bool": "?"}[kind], name
-        truth = load_truth(folder / entry["name"] / "truth.npz")
+        truth = load_truth(truth_folder / "truth.npz")
         assert np.abs(linear_to_srgb(np.clip(truth.image, 0, 1)) - linear_to_srgb(photo.image)).mean() < 0.02
         assert truth.mask[24, 24] == 1 and 0.2 < truth.mask.mean() < 0.9 and not truth.mask[:2].any()
         off = truth.region == 255
@@ -370,34 +441,45 @@ def test_a_benchmark_holds_photos_and_truth(built):
         )
         assert ((pixels > 0) & (pixels < settings.photo.size)).all()
         assert {0, 2, 3} <= set(np.unique(truth.face_region))
+        camera = Camera.from_json((photos / f"{entry['name']}.camera.json").read_text())
+        np.testing.assert_array_equal(camera.project(truth.vertices), truth.camera.project(truth.vertices))
+        views = load_views(truth_folder)
+        assert list(views) == list(VIEWS) and all(
+            (folder / "lights" / f"{v.light}.exr").is_file() for v in views.values()
+        )
+        for view in views.values():
+            assert view.image[view.mask == 1].mean() > 0.01 and not view.image[view.mask == 0].any()
+            assert set(np.unique(view.region[view.face])) <= {skin.SKIN, skin.EYE}
+        np.testing.assert_allclose(views["relit_1"].mask, truth.mask, atol=0.6)
+        assert np.abs(views["turned_left"].mask - truth.mask).max() > 0.6
 
 
 @pytest.mark.slow
-def test_portraits_that_are_there_are_kept(built, collection, monkeypatch):
+def test_portraits_that_are_there_are_kept(built, monkeypatch):
     """A second build takes nothing; a portrait whose photo is gone is taken again, to the same bits; other settings
     take all anew."""
-    folder, settings, sources, entries = built
+    folder, settings, sittings, entries = built
     taken = []
     original = benchmark.portrait
 
-    def spy(view, subject, shot):
+    def spy(view, subject, shot, beside):
         taken.append(shot.name)
-        return original(view, subject, shot)
+        return original(view, subject, shot, beside)
 
     monkeypatch.setattr(benchmark, "portrait", spy)
-    assert benchmark.build_benchmark(collection, folder, sources, None, 1, settings) == entries
+    assert benchmark.build_benchmark(sittings, folder, settings, 1) == entries
     assert not taken
-    photo = folder / entries[1]["name"] / "photo.jpg"
+    photo = folder / "photos" / f"{entries[1]['name']}.jpg"
     before = photo.read_bytes()
     photo.unlink()
     with pytest.raises(InputError, match="is missing"):
         benchmark.read_benchmark(folder)
-    benchmark.build_benchmark(collection, folder, sources, None, 1, settings)
+    benchmark.build_benchmark(sittings, folder, settings, 1)
     assert taken == [entries[1]["name"]] and photo.read_bytes() == before
     finer = replace(settings.photo, samples=16)
-    head = plan(choose_identities(heads_of(collection, "test")[:1], 1, 0), [], settings)[0]
-    assert all(benchmark.read_entry(folder / shot.name, shot.key(settings.photo)) for shot in head)
-    assert not any(benchmark.read_entry(folder / shot.name, shot.key(finer)) for shot in head)
+    shots = sittings[0].shots
+    assert all(benchmark.read_entry(folder, shot, shot.key(settings.photo)) for shot in shots)
+    assert not any(benchmark.read_entry(folder, shot, shot.key(finer)) for shot in shots)
 
 
 def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
@@ -410,16 +492,19 @@ def test_what_is_missing_or_wrong_is_said_in_one_line(collection, tmp_path):
     assert [source.name for source in select_sources(collection, "test", ["makehuman"], none)] == ["makehuman"]
     assert heads_of(collection, "train") == []
     with pytest.raises(InputError, match="no train heads of makehuman"):
-        settings = BenchmarkSettings(split="train")
-        benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), None, 1, settings)
+        plan_own(collection, (MakeHumanSource(8, None),), None, BenchmarkSettings(split="train"))
     head = heads_of(collection, "test")[0]
     with pytest.raises(InputError, match="is not the collection's"):
-        benchmark.rebuild_subject(MakeHumanSource(8, None), replace(head, person={"other": 1}))
+        rebuild_subject(MakeHumanSource(8, None), replace(head, person={"other": 1}))
     with pytest.raises(InputError, match=r"no \.exr"):
-        benchmark.build_benchmark(collection, tmp_path, (MakeHumanSource(8, None),), tmp_path, 1)
+        plan_own(collection, (MakeHumanSource(8, None),), tmp_path, BenchmarkSettings())
     with pytest.raises(InputError, match="no benchmark"):
         benchmark.read_benchmark(tmp_path)
-    for text in ("[]", '{"format": "other"}', '{"format": "sira-mi benchmark 1", "portraits": [{"name": "../x"}]}'):
+    for text in (
+        "[]",
+        '{"format": "other"}',
+        '{"format": "sira-mi benchmark 2", "portraits": [{"name": "../x", "relights": []}]}',
+    ):
         (tmp_path / "benchmark.json").write_text(text)
         with pytest.raises(InputError, match=r"benchmark\.json"):
             benchmark.read_benchmark(tmp_path)

@@ -1,10 +1,11 @@
 """`python -m studies.portraits build|fit|page|stranger|skin|landmarks …`: portraits of known heads, and fits to them.
 
-`build` renders portraits of the collection's test heads under known light; it resumes. `fit` fits and scores them;
-`page` writes the page, `docs/results.md`, from its figures. `stranger` writes a sheet of relit heads and photos that a
-stranger pairs blindly, and its key. `skin` and `landmarks` use portraits of training heads: `skin` measures how the
-radiance of skin and eyes predicts the skin's albedo, the values of `sira_mi.fit.skin`; `landmarks` measures the errors
-of detected landmarks and of the prior's landmarks, and writes the corrections of both.
+`build` renders portraits of known heads under known light, of VALID avatars (`--kind foreign`) or of a collection's
+test heads (`own`); it resumes. `fit` fits and scores them; `page` writes the page, `docs/results.md`, from its figures.
+`stranger` writes a sheet of relit heads and photos that a stranger pairs blindly, and its key. `skin` and `landmarks`
+use portraits of training heads: `skin` measures how the radiance of skin and eyes predicts the skin's albedo, which
+`sira_mi.fit.skin` holds; `landmarks` measures the errors of detected landmarks and of the prior's landmarks, and writes
+the corrections of both.
 """
 
 from sira_mi.errors import CommandParser, run_command

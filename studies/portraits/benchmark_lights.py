@@ -4,13 +4,22 @@
 from the side, from behind, or strongly coloured.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.training.collection.lighting import draw_sky, find_white_balance, read_map, render_lobes
+from sira_mi.errors import InputError
+from sira_mi.sg.lights_io import read_environment
+from sira_mi.training.collection.lighting import (
+    draw_sky,
+    find_white_balance,
+    map_directions,
+    read_map,
+    render_lobes,
+)
 
 LIGHTS = ("studio", "outdoor", "extreme")
 EXTREMES = ("side", "back", "coloured")
@@ -18,6 +27,9 @@ HARD = 500.0  # sharpness of the extreme light's lobe: 2.6 degrees to one standa
 BALANCE = 0.8  # share of the way to full white balance, of environments
 SOFT = 6.0  # degrees, blur of an environment as a background
 BRIGHTEST = 1.5  # linear, of the background
+BUSY_VIEW = 100.0  # degrees of an environment across a busy background
+BUSY_LUMINANCE = (0.15, 0.4)  # its mean
+FEWEST_RELIGHTS = 4  # environments from which each head can have two, none its own
 
 
 def light_map(light: str, random: np.random.Generator, yaw: float, environment: Path | None, extreme: str):
@@ -46,6 +58,48 @@ def backdrop(light: str, random: np.random.Generator, image: np.ndarray, directi
     spot = random.uniform(-0.4, 0.4, 2)
     fall = 1 - 0.22 * ((x - spot[0]) ** 2 + (y - spot[1]) ** 2) / 2
     return brightness * fall[..., None] * _tint(random, 0.06)
+
+
+def busy_backdrop(random: np.random.Generator, environment: Path, directions: np.ndarray) -> np.ndarray:
+    """The background [H, W, 3] in viewing directions [H, W, 3], in the photo's scale: an environment in focus."""
+    image = read_environment(environment)
+    behind = look_up(image * find_white_balance(read_map(environment)) ** BALANCE, directions)
+    mean = np.minimum(behind, 4 * np.median(behind)).mean(axis=(0, 1)) @ np.array(LUMINANCE)
+    return behind * random.uniform(*BUSY_LUMINANCE) / mean
+
+
+def draw_relights(environments: list[Path], taken: Sequence[Path | None], seed: int) -> list[tuple[Path, Path]]:
+    """Two environments for each portrait, none the portrait's own, `taken`: one of the more even half of all, and one
+    of the more directed half, in turns the first. All are drawn about equally often. Raises InputError for fewer than
+    `FEWEST_RELIGHTS` environments."""
+    if len(environments) < FEWEST_RELIGHTS:
+        raise InputError(
+            f"{len(environments)} environment maps: relighting takes {FEWEST_RELIGHTS} or more; name a folder by --hdri"
+        )
+    random = np.random.default_rng([seed, 43])
+    ranked = sorted(environments, key=lambda path: (measure_direction(read_map(path)), path.name))
+    halves = ranked[: len(ranked) // 2], ranked[len(ranked) // 2 :]
+    uses = dict.fromkeys(environments, 0)
+    pairs = []
+    for number, own in enumerate(taken):
+        pair = []
+        for half in halves:
+            free = [path for path in half if path != own]
+            least = min(uses[path] for path in free)
+            path = free[random.choice([k for k, path in enumerate(free) if uses[path] == least])]
+            uses[path] += 1
+            pair.append(path)
+        first, second = pair if number % 2 == 0 else pair[::-1]
+        pairs.append((first, second))
+    return pairs
+
+
+def measure_direction(image: np.ndarray) -> float:
+    """How directed the light of a map [H, 2H, 3] is: the length of its mean flux vector over its mean radiance, by
+    luminance; 0 for an even light, 1 for a distant lamp."""
+    directions = map_directions(len(image))
+    weight = (image @ np.array(LUMINANCE)) * np.sqrt(np.maximum(1 - directions[..., 1] ** 2, 0))
+    return float(np.linalg.norm((weight[..., None] * directions).sum((0, 1))) / weight.sum())
 
 
 def blur(image: np.ndarray, degrees: float) -> np.ndarray:

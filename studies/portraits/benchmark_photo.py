@@ -4,6 +4,7 @@ The photo's material is not the one that a fit assumes: its roughness varies by 
 part is Burley's.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -12,7 +13,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from sira_mi.conventions import LUMINANCE
-from sira_mi.training.collection.render import Part, build_mesh, intrinsic_matrix, look_at
+from sira_mi.portrait.camera import yaw_rotation
+from sira_mi.training.collection.render import Part, build_mesh, intrinsic_matrix, look_at, point_towards
 from sira_mi.training.collection.skin import CLOTH, EYE, HAIR, SKIN
 
 NOTHING = 255  # region code of pixels off the person
@@ -21,29 +23,57 @@ ROUGHNESS = {SKIN: (0.35, 0.55), HAIR: (0.3, 0.5), EYE: (0.05, 0.2), CLOTH: (0.7
 FILM_DIAGONAL = 43.2666  # mm, of the 36 mm x 24 mm frame
 ABOVE = 0.35  # scene units between the highest hair and the upper edge of the photo
 LANES = 4_000_000  # paths a launch
+JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
 class PhotoSettings:
     size: int = 512  # pixels, width and height
     samples: int = 256  # paths a pixel, a power of four
+    view_samples: int = 64  # the same, of relit and turned views and of persons in the background
     depth: int = 6  # path length, bounces
     shading_samples: int = 64  # directions a pixel, of the truth's shading and shadow; a power of four
     specular_step: float = 0.05  # specular strengths are rounded to its multiples; 0.004 of reflectance
+    jpeg_quality: int = JPEG_QUALITY
+    jpeg_subsampling: int = 0  # of the colours: 0 for 4:4:4, 2 for 4:2:0
 
 
-def portrait_camera(
-    parts: list[Part], yaw: float, pitch: float, focal_35mm: float, extent: float, size: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """K [3, 3] and world-to-camera [4, 4] of a square photo of `size` pixels that shows `extent` scene units across at
-    the head, from the hair down; angles in degrees, the focal length in mm on film of the same diagonal."""
-    fov = 2 * np.degrees(np.arctan(FILM_DIAGONAL / (2 * np.sqrt(2) * focal_35mm)))
+@dataclass(frozen=True)
+class Pose:
+    """How an identity is photographed, the same under each light."""
+
+    yaw: float  # degrees about the head, positive to its left
+    pitch: float  # degrees, positive from above
+    focal_35mm: float  # mm, on film of the same diagonal
+    extent: float  # scene units across the photo at the head
+    height: float | None = None  # of the photo's middle, scene units; None for what shows the hair from its top down
+    aside: float = 0.0  # scene units from the head to the photo's middle, positive to the right in the photo
+
+    @property
+    def field_of_view(self) -> float:
+        """Degrees across the photo."""
+        return 2 * np.degrees(np.arctan(FILM_DIAGONAL / (2 * np.sqrt(2) * self.focal_35mm)))
+
+    @property
+    def distance(self) -> float:
+        """Scene units from the camera to the head."""
+        return self.extent / (2 * np.tan(np.radians(self.field_of_view) / 2))
+
+
+def find_focal(distance: float, extent: float) -> float:
+    """The focal length in mm on 35 mm film of a square photo that shows `extent` across at that distance, both in scene
+    units."""
+    return FILM_DIAGONAL / np.sqrt(2) * distance / extent
+
+
+def portrait_camera(parts: list[Part], pose: Pose, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """K [3, 3] and world-to-camera [4, 4] of a square photo of `size` pixels."""
     top = max(part.vertices[:, 1].max() for part in parts)
-    target = np.array([0.0, top + ABOVE - extent / 2, 0.0])
-    a, e = np.radians(yaw), np.radians(pitch)
-    away = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
-    distance = extent / (2 * np.tan(np.radians(fov) / 2))
-    return intrinsic_matrix(fov, size), look_at(target + distance * away, target)
+    height = top + ABOVE - pose.extent / 2 if pose.height is None else pose.height
+    a = np.radians(pose.yaw)
+    target = np.array([0.0, height, 0.0]) + pose.aside * np.array([np.cos(a), 0.0, -np.sin(a)])
+    away = point_towards(a, np.radians(pose.pitch))
+    return intrinsic_matrix(pose.field_of_view, size), look_at(target + pose.distance * away, target)
 
 
 def level_parts(part: Part, step: float) -> list[tuple[Part, float]]:
@@ -84,27 +114,52 @@ def draw_roughness(random: np.random.Generator) -> dict[int, float]:
 
 
 class View:
-    """An identity and its camera. What does not depend on the light is computed once for all photos."""
+    """An identity and its camera. What does not depend on the light is computed once for all photos: `truth`, the
+    arrays of the portrait's truth that are known without light."""
 
     def __init__(self, parts: list[Part], roughness: dict[int, float], K, world_to_camera, settings: PhotoSettings):
         self.settings = settings
-        self.K, self.world_to_camera = K, world_to_camera
+        self.K, self.world_to_camera, self.turned = K, world_to_camera, 0.0
         pieces = [piece for part in parts for piece in level_parts(part, settings.specular_step)]
         self.meshes = [principled_mesh(f"part{i}", *piece, roughness) for i, piece in enumerate(pieces)]
         self.scene = self._lit(np.ones((2, 4, 3)))
-        self.pixels = np.flatnonzero(binary_dilation(self._covered(), np.ones((3, 3), bool)))
+        self._look()
         self.truth = {
             "K": K.astype(np.float32),
             "world_to_camera": world_to_camera.astype(np.float32),
-            **self._centre_maps(),
+            "region": self.region,
+            "normal": self.normal,
             **self._albedo_maps(),
             **triangle_soup(parts),
         }
-        self.centres = np.flatnonzero(self.truth["region"].reshape(-1) != NOTHING)
+
+    def turn(self, degrees: float) -> "View":
+        """The identity turned to its left about the vertical through its own origin, while camera and light stay; they
+        are turned about it instead, so that the world remains the identity's own frame. Without `truth`."""
+        view = copy(self)
+        del view.truth
+        rotation = np.eye(4)
+        rotation[:3, :3] = yaw_rotation(degrees)
+        view.turned, view.world_to_camera = self.turned + degrees, self.world_to_camera @ rotation
+        view._look()
+        return view
+
+    def _look(self):
+        """Finds the covered pixels, and what is at their centres."""
+        self.pixels = np.flatnonzero(binary_dilation(self._covered(), np.ones((3, 3), bool)))
+        self.region, self.normal, self.position = self._centre_maps()
+        self.centres = np.flatnonzero(self.region.reshape(-1) != NOTHING)
 
     def _lit(self, light):
         scene: dict[str, object] = {f"part{i}": mesh for i, mesh in enumerate(self.meshes)}
-        scene["light"] = {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32)), "mis_compensation": True}
+        to_world = np.eye(4)
+        to_world[:3, :3] = yaw_rotation(-self.turned)
+        scene["light"] = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(light.astype(np.float32)),
+            "mis_compensation": True,
+            "to_world": mi.ScalarTransform4f(to_world.tolist()),
+        }
         return mi.load_dict({"type": "scene", **scene})
 
     def _rays(self, pixel, dx, dy):
@@ -131,16 +186,18 @@ class View:
         return np.array(hit).reshape(size, size, grid * grid).any(-1)
 
     def _centre_maps(self):
-        """Region [H, W] and unit normal [H, W, 3] of the first hits at pixel centres."""
+        """Region [H, W], unit normal and position [H, W, 3] of the first hits at pixel centres."""
         size = self.settings.size
         hit = self.scene.ray_intersect(self._rays(dr.arange(mi.UInt32, size * size), 0.5, 0.5))
         valid = hit.is_valid()
         code = dr.select(valid, hit.shape.eval_attribute_1("face_region", hit, valid), NOTHING)
         normal = dr.select(valid, hit.sh_frame.n, 0)
-        return {
-            "region": np.rint(np.array(code)).astype(np.uint8).reshape(size, size),
-            "normal": np.array(normal).T.astype(np.float32).reshape(size, size, 3),
-        }
+        position = np.array(dr.select(valid, hit.p, 0)).T.reshape(size, size, 3)
+        return (
+            np.rint(np.array(code)).astype(np.uint8).reshape(size, size),
+            np.array(normal).T.astype(np.float32).reshape(size, size, 3),
+            position,
+        )
 
     def _albedo_maps(self, grid: int = 4):
         """Diffuse albedo [H, W, 3] and reflectance at normal incidence [H, W]: the means over the covered part of each
@@ -164,17 +221,19 @@ class View:
             "specular_albedo": means[..., 3].astype(np.float32),
         }
 
-    def directions(self) -> np.ndarray:
-        """Unit viewing directions [H, W, 3] of the pixel centres in the world."""
+    def directions(self, field_of_view: float | None = None) -> np.ndarray:
+        """Unit viewing directions [H, W, 3] of the pixel centres in the world; with `field_of_view`, those of a camera
+        that sees so many degrees across."""
         size = self.settings.size
+        K = self.K if field_of_view is None else intrinsic_matrix(field_of_view, size)
         x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
-        local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(self.K).T
+        local = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(K).T
         way = local @ self.world_to_camera[:3, :3]
         return way / np.linalg.norm(way, axis=-1, keepdims=True)
 
-    def photograph(self, light: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def photograph(self, light: np.ndarray, seed: int, samples: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Linear radiance [H, W, 3] under a map [H, 2H, 3], black off the person (premultiplied), and the coverage
-        [H, W] in 0..1."""
+        [H, W] in 0..1; with `samples` paths a pixel, a power of four, instead of those of a photo."""
         self.scene = self._lit(light)
         settings = self.settings
         integrator = mi.load_dict({"type": "path", "max_depth": settings.depth, "hide_emitters": True})
@@ -185,7 +244,7 @@ class View:
             # A rare sample of `principled` at grazing angles is not a number; it counts as black.
             return [*(dr.select(dr.isfinite(c), c, 0) for c in radiance), dr.select(valid, mi.Float(1), 0)]
 
-        values = self._mean(sample, self.pixels, settings.samples, seed)
+        values = self._mean(sample, self.pixels, samples or settings.samples, seed)
         return values[..., :3], np.clip(values[..., 3], 0, 1)
 
     def shading(self, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
 from studies.cache import fingerprint, load_or_compute
 from studies.portraits.appearance_scores import PredictedAppearance, score_appearance
-from studies.portraits.benchmark import read_benchmark
+from studies.portraits.benchmark import photo_of, read_benchmark, truth_of
 from studies.portraits.fit_job import Job
 from studies.portraits.geometry_scores import PredictedHead, score_geometry, true_surface
 from studies.portraits.methods import BY_NAME, METHODS
@@ -77,30 +77,31 @@ def _complete(names: Sequence[str]) -> list[str]:
 
 
 def _portrait_rows(comparison: Comparison, entry: dict, methods: list[str]):
-    folder = comparison.benchmark / entry["name"]
+    photo = photo_of(comparison.benchmark, entry["name"])
+    truth_file = truth_of(comparison.benchmark, entry["name"]) / "truth.npz"
     truth = surface = None
 
     def score(path: Path, key: str, head) -> dict:
         def compute() -> dict:
             nonlocal truth, surface
-            truth = truth or load_truth(folder / "truth.npz")
+            truth = truth or load_truth(truth_file)
             surface = surface or true_surface(truth)
             geometry, appearance = head(truth)
             scores = score_geometry(geometry, truth, surface)
             return scores if appearance is None else scores | score_appearance(appearance, truth)
 
-        return load_or_compute(path, fingerprint(_VERSION, key, folder / "truth.npz"), compute)
+        return load_or_compute(path, fingerprint(_VERSION, key, truth_file), compute)
 
     described = {"portrait": entry["name"], "identity": entry["identity"], "light": entry["light"]}
     mean = comparison.runs / entry["name"] / "mean_head.json"
-    key = fingerprint(comparison.prior, folder / "photo.jpg")
-    scores = score(mean, key, lambda truth: (mean_head(folder / "photo.jpg", comparison.prior), None))
+    key = fingerprint(comparison.prior, photo)
+    scores = score(mean, key, lambda truth: (mean_head(photo, comparison.prior), None))
     yield {**described, "method": MEAN_HEAD, "scores": scores}
     for name in methods:
         method = BY_NAME[name]
         out = comparison.runs / entry["name"] / name
         job = Job(
-            folder / "photo.jpg",
+            photo,
             name,
             comparison.prior,
             QUALITIES[comparison.quality],

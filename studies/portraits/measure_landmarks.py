@@ -20,7 +20,7 @@ from sira_mi.portrait.head_landmarks import (
 )
 from sira_mi.portrait.load import DEFAULT_MAX_PIXELS, load_photo
 from sira_mi.portrait.portrait import make_display_image
-from studies.portraits.benchmark import read_benchmark
+from studies.portraits.benchmark import photo_of, read_benchmark, truth_of
 from studies.portraits.truth import load_truth
 
 _ALIGNMENTS = 5  # passes of the mean face
@@ -48,18 +48,18 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
     Raises InputError for portraits of test heads."""
     found, blind = [], []
     for entry in tqdm(read_benchmark(benchmark, "train"), unit="portrait", dynamic_ncols=True):
-        folder = benchmark / entry["name"]
-        truth = load_truth(folder / "truth.npz")
+        name = entry["name"]
+        truth = load_truth(truth_of(benchmark, name) / "truth.npz")
         known = np.isfinite(truth.landmarks).all(axis=1)
         true = np.full((len(truth.landmarks), 2), np.nan)
         true[known] = truth.camera.project(truth.landmarks[known])
-        faces = find_faces(make_display_image(load_photo(folder / "photo.jpg", DEFAULT_MAX_PIXELS).image))
+        faces = find_faces(make_display_image(load_photo(photo_of(benchmark, name), DEFAULT_MAX_PIXELS).image))
         observations = [Observation(entry["identity"], face, true) for face in faces]
         near = [o for o in observations if np.nanmean(np.abs(o.offset)) < _ELSEWHERE]
         if near:
             found.append(near[0])
         else:
-            blind.append(entry["name"])
+            blind.append(name)
     return found, blind
 
 

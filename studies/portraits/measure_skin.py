@@ -16,7 +16,7 @@ from sira_mi.fit.skin import SkinCues, SkinLevel, cue_arrays, find_near_landmark
 from sira_mi.portrait.landmarks import BARE_SKIN
 from sira_mi.portrait.portrait import PortraitSettings, make_portrait
 from sira_mi.training.collection.skin import SKIN
-from studies.portraits.benchmark import read_benchmark
+from studies.portraits.benchmark import photo_of, read_benchmark, truth_of
 from studies.portraits.truth import Truth, load_truth
 
 # Fewer portraits than this with eyes, or fewer heads, determine nothing.
@@ -54,14 +54,14 @@ def observe(benchmark: Path) -> tuple[list[Observation], list[str]]:
     settings = PortraitSettings(working_size=QUALITIES["draft"].working_size)
     found, blind = [], []
     for entry in tqdm(read_benchmark(benchmark, "train"), unit="portrait", dynamic_ncols=True):
-        folder = benchmark / entry["name"]
-        luminance = true_luminance(load_truth(folder / "truth.npz"))
+        name = entry["name"]
+        luminance = true_luminance(load_truth(truth_of(benchmark, name) / "truth.npz"))
         try:
-            cues = find_skin_cues(make_portrait(folder / "photo.jpg", settings, landmarks))
+            cues = find_skin_cues(make_portrait(photo_of(benchmark, name), settings, landmarks))
         except InputError:
             cues = None
         if cues is None or luminance is None:
-            blind.append(entry["name"])
+            blind.append(name)
         else:
             found.append(Observation(entry["identity"], cues, luminance))
     return found, blind

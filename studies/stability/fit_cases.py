@@ -14,7 +14,8 @@ from sira_mi.files import write_png, write_text, write_through
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.stage import FitSettings
 from sira_mi.portrait.camera import Camera
-from studies.portraits.benchmark import EXIF_IFD, FOCAL_TAG, JPEG_QUALITY
+from studies.portraits.benchmark import EXIF_IFD, FOCAL_TAG
+from studies.portraits.benchmark_photo import JPEG_QUALITY
 from studies.portraits.truth import Truth
 from studies.stability.fit_truth import FOCAL_35MM
 

@@ -149,15 +149,16 @@ def read_avatar(path: Path) -> tuple[dict[str, Surface], np.ndarray]:
     missing = [name for name in (BODY, *EYES, *GLANDS) if name not in names]
     if missing:
         raise BrokenHead(f"it has no part {missing[0]}")
-    painted = _read_texture(path.with_name(f"{path.stem}.jpg"))
+    painted = read_texture(path.with_name(f"{path.stem}.jpg"))
     surfaces = {name: _surface(v, f[part == names.index(name)], uv, painted) for name in (BODY, *EYES, *GLANDS)}
     if WIG in names:
-        strands = _read_texture(path.with_name(f"{path.stem}_wig.jpg"))
+        strands = read_texture(path.with_name(f"{path.stem}_wig.jpg"))
         surfaces[WIG] = _surface(v, f[part == names.index(WIG)], uv, strands)
     return surfaces, eyes.astype(float)
 
 
-def _read_texture(path):
+def read_texture(path: Path) -> np.ndarray:
+    """Linear [H, W, 3] of an image file. Raises BrokenHead when it cannot be read."""
     try:
         with Image.open(path) as image:
             if max(image.size) > LARGEST_TEXTURE:
