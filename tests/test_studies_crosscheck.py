@@ -265,9 +265,8 @@ def fit_rows():
     scores = [{"h3ds_face_mean": 1.0, "final_psnr": 30.0}, {"h3ds_face_mean": 2.0, "final_psnr": 32.0}]
     rows = []
     for k, score in enumerate(scores):
-        rows.append({"portrait": f"p{k}", "method": "a.4", "scores": score, "total_seconds": 20.0})
-        rows.append({"portrait": f"p{k}", "method": "b.3", "scores": score, "total_seconds": 10.0})
-    return [*rows, {"portrait": "p2", "method": "b.3", "error": "no face"}]
+        rows.append({"portrait": f"p{k}", "row": "draft", "scores": score, "wall_seconds": 30.0})
+    return [*rows, {"portrait": "p2", "row": "draft", "error": "no face"}]
 
 
 SCENE = """<scene version="3.0.0">

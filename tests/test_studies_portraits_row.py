@@ -6,13 +6,15 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from conftest import camera
 from egg import SIZE, head_like, landmarks_on, truth_of, write_truth, write_views
 
 from sira_mi.avatar.file import save_avatar
 from sira_mi.errors import InputError
 from sira_mi.files import write_exr, write_png
 from sira_mi.portrait.portrait import area_resample
-from studies.portraits.score_row import place_in_photo, score_portrait
+from studies.portraits.photo_frame import PhotoFrame
+from studies.portraits.score_row import score_portrait
 from studies.portraits.truth import VIEWS, Truth
 
 EXPOSURES = {"noon": 1.0, "lamp": 2.0}
@@ -66,10 +68,10 @@ def test_a_part_of_a_photo_is_placed_where_it_was():
     photo = np.random.default_rng(1).uniform(0, 1, (20, 30, 3)).astype(np.float32)
     window = (4.0, 2.0, 24.0, 18.0)
     part = area_resample(photo, (4, 2), (3, 3), (60, 48))
-    placed = place_in_photo(part, window, 20, 30)
+    placed = PhotoFrame(camera(focal=40), window).lay_on_photo(part, 30, 20)
     np.testing.assert_allclose(placed[2:18, 4:24], photo[2:18, 4:24], atol=1e-5)
     assert not placed[:2].any() and not placed[18:].any() and not placed[:, :4].any() and not placed[:, 24:].any()
-    np.testing.assert_array_equal(place_in_photo(photo, (0, 0, 30, 20), 20, 30), photo)
+    np.testing.assert_array_equal(PhotoFrame(camera(focal=40), (0, 0, 30, 20)).lay_on_photo(photo, 30, 20), photo)
 
 
 @pytest.mark.slow

@@ -36,7 +36,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--voxel", type=float, default=0.02, help="spacing of the reference's mesh (default: 0.02)")
     parser.add_argument("--lights", nargs="+", metavar="NAME", help="settings of lights (default: all)")
     parser.add_argument(
-        "--fits", nargs="+", type=Path, default=(), metavar="ROWS", help="rows.json of evaluate fits, one a quality"
+        "--fits",
+        nargs="+",
+        type=Path,
+        default=(),
+        metavar="ROWS",
+        help="rows.json of portraits score, one a row of fits",
     )
     parser.add_argument(
         "--evidence", type=Path, metavar="DIR", help="keep what is measured of each light there; a new run resumes"

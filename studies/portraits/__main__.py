@@ -1,7 +1,9 @@
-"""`python -m studies.portraits build|fit|page|stranger|skin|landmarks …`: portraits of known heads, and fits to them.
+"""`python -m studies.portraits build|fit|score|page|stranger|skin|landmarks …`: portraits of known heads, and fits to
+them.
 
 `build` renders portraits of known heads under known light, of VALID avatars (`--kind foreign`) or of a collection's
-test heads (`own`); it resumes. `fit` fits and scores them; `page` writes the page, `docs/results.md`, from its figures.
+test heads (`own`). `fit` makes rows, fits and baselines (`studies.portraits.rows`), and `score` scores them. All three
+resume portrait by portrait. `page` writes the page, `docs/results.md`, from its figures, or measures them before.
 `stranger` writes a sheet of relit heads and photos that a stranger pairs blindly, and its key. `skin` and `landmarks`
 use portraits of training heads: `skin` measures how the radiance of skin and eyes predicts the skin's albedo, which
 `sira_mi.fit.skin` holds; `landmarks` measures the errors of detected landmarks and of the prior's landmarks, and writes
@@ -9,9 +11,17 @@ the corrections of both.
 """
 
 from sira_mi.errors import CommandParser, run_command
-from studies.portraits.commands import build, fit, landmarks, page, skin, stranger
+from studies.portraits.commands import build, fit, landmarks, page, score, skin, stranger
 
-COMMANDS = {"build": build, "fit": fit, "page": page, "stranger": stranger, "skin": skin, "landmarks": landmarks}
+COMMANDS = {
+    "build": build,
+    "fit": fit,
+    "score": score,
+    "page": page,
+    "stranger": stranger,
+    "skin": skin,
+    "landmarks": landmarks,
+}
 
 
 def main() -> None:

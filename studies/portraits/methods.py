@@ -4,7 +4,7 @@ Geometry: a.3 has a rendering function that is not learned before, a.4 is SIRA. 
 on: b.1 has no prior, b.2 the AF-SM and its schedule, b.3 is the fit as it ships, with the refinement, b.4 is b.3 with a
 shading stage, which a draft has not, b.5 a polish after b.3, b.6 is b.3 without shadows: all light of the upper
 hemisphere arrives at every point, and b.7 gives all that base albedo and light leave of the photo to the albedo, as the
-paper does.
+paper does. `landmarks` has the shape and pose that the landmarks alone tell, and the appearance of b.3.
 """
 
 from collections.abc import Callable
@@ -13,15 +13,18 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from sira_mi.avatar.file import Avatar
+from sira_mi.avatar.shape import POSE, SHAPE_LATENTS
 from sira_mi.fields.mlp import initial_parameters
+from sira_mi.fields.sdf import SdfField
 from sira_mi.fit.appearance import AppearanceStage
-from sira_mi.fit.geometry import GeometryStage
+from sira_mi.fit.geometry import GeometryStage, LatentProblem, LatentStage, share_scene
 from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
 from sira_mi.fit.settings import add_shading, polish_stage
-from sira_mi.fit.shaded import DIRECTIONS, PhotoPoints, find_masked_points
+from sira_mi.fit.shaded import DIRECTIONS, Arrays, PhotoPoints, find_masked_points
 from sira_mi.fit.shading import ShadingStage
-from sira_mi.fit.stage import FitSettings, FitTask, Stage
+from sira_mi.fit.stage import FitSettings, FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
+from sira_mi.optimisation.losses import squared_norm
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.training.af_sm import initial_appearance_model
 
@@ -44,6 +47,25 @@ class UnshadowedTask(FitTask):
     def photo_points(self, portrait: Portrait, head) -> PhotoPoints:
         seen = find_masked_points(portrait, head)
         return PhotoPoints(**vars(seen), unoccluded=np.ones((DIRECTIONS, len(seen.row)), bool))
+
+
+@dataclass(frozen=True)
+class LandmarkStage(LatentStage):
+    """Shape and pose by the landmarks and the prior; the photo's colours and mask do not count."""
+
+    def problem(self, task: FitTask, state: FitState) -> Problem:
+        return LandmarkProblem(self, share_scene(task))
+
+
+class LandmarkProblem(LatentProblem):
+    """The losses of the landmarks and of the latent codes."""
+
+    def _losses_of(self, shape: SdfField, parameters: Arrays, step: int, rng: np.random.Generator) -> Arrays:
+        weights = self.stage.weights
+        terms = {"embedding": weights.embedding * squared_norm(*(parameters[name] for name in SHAPE_LATENTS))}
+        if self.scene.landmarks is not None:
+            terms["landmark"] = weights.landmark * self._landmark_loss(shape, self.scene.landmarks)
+        return terms
 
 
 @dataclass(frozen=True)
@@ -102,6 +124,14 @@ def _rendering_from_scratch(shipped: Stages) -> Stages:
     return tuple(result)
 
 
+def _landmarks_alone(shipped: Stages) -> Stages:
+    """One stage as long as all geometry stages, which moves shape and pose by the landmarks, and the appearance."""
+    geometry = _geometry(shipped)
+    rates = {name: geometry[0].rates[name] for name in (*SHAPE_LATENTS, POSE)}
+    stage = LandmarkStage("landmarks", sum(stage.steps for stage in geometry), rates)
+    return (stage, *(after for after in _after_geometry(shipped) if not isinstance(after, ShadingStage)))
+
+
 def _without_prior(shipped: Stages) -> Stages:
     """One stage as long as all appearance stages, from untrained networks, without refinement."""
     steps = sum(stage.steps for stage in shipped if isinstance(stage, AppearanceStage))
@@ -140,6 +170,7 @@ METHODS = (
         "a.3", "deformation and reference", _rendering_from_scratch, _untrained_rendering, task=UntrainedRadianceTask
     ),
     Method("a.4", "SIRA: shape and appearance learned together", _geometry, _unchanged),
+    Method("landmarks", "shape and pose by landmarks alone", _landmarks_alone, _unchanged),
     Method("b.1", "no prior", _without_prior, _untrained_appearance, after="a.4"),
     Method("b.2", "AF-SM and schedule", _without_refinement, _unchanged, after="a.4"),
     Method("b.3", "with refinement: the shipped fit", _after_geometry, _unchanged, after="a.4"),
@@ -149,4 +180,3 @@ METHODS = (
     Method("b.7", "as b.3, all of the residual to the albedo", _all_to_the_albedo, _unchanged, after="a.4"),
 )
 BY_NAME = {method.name: method for method in METHODS}
-SHIPPED = "b.3"  # the fit as it ships

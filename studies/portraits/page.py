@@ -157,17 +157,17 @@ def render_page(foreign: dict | None, own: dict | None) -> str:
         what=_describe(shown),
         revision=find(shown, "measured", "revision") or "–",
         date=find(shown, "measured", "date") or "–",
-        headline=_table(rows, HEADLINE),
-        tails=_table(rows, TAILS),
-        parts=_table(rows, PARTS),
-        shares=_table(rows, SHARE_COLUMNS),
+        headline=render_table(rows, HEADLINE),
+        tails=render_table(rows, TAILS),
+        parts=render_table(rows, PARTS),
+        shares=render_table(rows, SHARE_COLUMNS),
         groups_psnr=_groups(shown, "relit_psnr", 1),
         groups_ssim=_groups(shown, "relit_ssim", 3),
         groups_face=_groups(shown, "h3ds_face_mean", 2),
-        geometry=_table(rows, GEOMETRY),
-        appearance=_table(rows, APPEARANCE),
+        geometry=render_table(rows, GEOMETRY),
+        appearance=render_table(rows, APPEARANCE),
         ladder=_ladder(shown.get("ladder", [])) + _strangers(shown.get("stranger", [])),
-        cost=_table(rows, COSTS),
+        cost=render_table(rows, COSTS),
         own=_own(own),
         failed=_failed([*shown["failed"], *(own["failed"] if own else [])]),
         pictures=_pictures(shown.get("pictures", {})),
@@ -181,8 +181,8 @@ def _describe(figures: Mapping) -> str:
     )
 
 
-def _table(rows: Mapping[str, dict], columns: Sequence[Column]) -> str:
-    """A line for each row that has one of the columns."""
+def render_table(rows: Mapping[str, dict], columns: Sequence[Column]) -> str:
+    """A line for each of the figures' `rows` that has one of the columns, as Markdown."""
     lines = []
     for row in rows.values():
         values = [find(row, *column.path) for column in columns]
@@ -200,7 +200,7 @@ def _groups(figures: Mapping, score: str, digits: int) -> str:
         (kind, name): f"{name} ({count})" for kind, names in figures["groups"].items() for name, count in names.items()
     }
     columns = [Column(title, ("by", *group, score), digits) for group, title in titles.items()]
-    return _table(figures["rows"], columns)
+    return render_table(figures["rows"], columns)
 
 
 def _own(own: dict | None) -> str:
@@ -209,7 +209,7 @@ def _own(own: dict | None) -> str:
     measured = own["measured"]
     return (
         f"{own['portraits']} portraits, measured at revision `{measured['revision']}` on {measured['date']}: "
-        f"[data/own.json](data/own.json).\n\n{_table(own['rows'], OWN)}"
+        f"[data/own.json](data/own.json).\n\n{render_table(own['rows'], OWN)}"
     )
 
 

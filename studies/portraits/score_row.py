@@ -17,18 +17,15 @@ from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.files import read_exr, read_json
 from sira_mi.portrait.camera import Camera
-from sira_mi.portrait.portrait import area_resample
 from studies.portraits.appearance_scores import PredictedAppearance, score_appearance, score_tone
 from studies.portraits.geometry_scores import PredictedHead, TrueSurface, score_geometry, true_surface
+from studies.portraits.photo_frame import read_frame
 from studies.portraits.relit_scores import score_view
 from studies.portraits.truth import VIEWS, TrueView, Truth, load_truth, load_views
 
 VERSION = "1"  # of the scores, for the keys of caches
 _LAYERS = ("normal", "final", "diffuse", "specular", "diffuse_albedo", "specular_albedo")
-_LARGEST_REPORT = 16 << 20  # bytes
 _HEAD = ("vertices", "faces", "landmarks", "K", "world_to_camera")
-
-Window = tuple[float, float, float, float]
 
 
 def score_portrait(
@@ -81,27 +78,21 @@ def read_avatar(folder: Path, prior: Path, height: int, width: int) -> tuple[Pre
     """What a fit's folder says about the head and its appearance at the pixels of a photo of that size."""
     import trimesh  # takes seconds
 
-    report = read_json(folder / "avatar.json", "report of a fit", _LARGEST_REPORT)
-    camera = Camera.from_dict(report.get("camera"), f"the camera in {folder / 'avatar.json'}")
-    window = tuple(report.get("window") or (0.0, 0.0, width, height))
-    if len(window) != 4:
-        raise InputError(f"{folder / 'avatar.json'}: the window of the photo must be four numbers; fit the photo again")
-    x0, y0, x1, y1 = window
-    photo = camera.scale((x1 - x0) / camera.width, (y1 - y0) / camera.height).crop(-x0, -y0, width, height)
+    frame = read_frame(folder)
     try:
         layers = {name: read_exr(folder / "renders" / f"{name}.exr")[0] for name in _LAYERS}
         mask = np.asarray(Image.open(folder / "renders" / "mask.png").convert("L"), np.float32) / 255
         mesh: Any = trimesh.load(folder / "mesh.ply", process=False)
     except (OSError, ValueError) as error:
         raise InputError(f"{folder} is not the folder of a complete fit: {error}; fit the photo again") from error
-    layers = {name: place_in_photo(image, window, height, width) for name, image in layers.items()}
-    mask = place_in_photo(mask, window, height, width)
+    layers = {name: frame.lay_on_photo(image, width, height) for name, image in layers.items()}
+    mask = frame.lay_on_photo(mask, width, height)
     avatar = load_avatar(folder / "avatar.safetensors")
     head = PredictedHead(
         vertices=np.asarray(mesh.vertices, np.float64) * (1000 / MILLIMETRES_PER_UNIT),
         faces=np.asarray(mesh.faces),
         landmarks=landmarks_of(load_avatar(prior), HeadShape(avatar.architecture).field(avatar.tensors)),
-        camera=photo,
+        camera=frame.camera_of_photo(width, height),
         normal=layers["normal"],
         mask=mask,
     )
@@ -112,17 +103,6 @@ def read_avatar(folder: Path, prior: Path, height: int, width: int) -> tuple[Pre
         mask=mask,
         shaded=layers["diffuse"] + layers["specular"],
     )
-
-
-def place_in_photo(image: np.ndarray, window: Window, height: int, width: int) -> np.ndarray:
-    """An image [H, W, ...] of the part `window` (x0, y0, x1, y1, pixels) of a photo at the photo's own pixels [height,
-    width, ...], by the areas that they share; 0 outside the window."""
-    x0, y0, x1, y1 = window
-    across, down = image.shape[1] / (x1 - x0), image.shape[0] / (y1 - y0)
-    placed = area_resample(image, (-x0 * across, -y0 * down), (1 / across, 1 / down), (width, height))
-    row, column = np.arange(height) + 0.5, np.arange(width) + 0.5
-    inside = ((row > y0) & (row < y1))[:, None] & ((column > x0) & (column < x1))
-    return np.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), placed, 0)
 
 
 def _read_head(path: Path, height: int, width: int) -> PredictedHead:
