@@ -10,6 +10,7 @@ from sira_mi.errors import InputError
 from studies.data import read_figures, write_figures
 from studies.markdown import number, table
 from studies.portraits import page
+from studies.portraits.commands.page import write_notes
 from studies.portraits.summary import summarise
 from studies.priors import page as prior_page
 from studies.priors.summary import summarise as summarise_prior
@@ -157,3 +158,16 @@ def test_figures_say_when_they_were_measured(figures, tmp_path):
         (tmp_path / page.FIGURES["foreign"]).write_text(damaged)
         with pytest.raises(InputError, match="no figures of a study"):
             read_figures(tmp_path / page.FIGURES["foreign"])
+
+
+def test_notes_are_put_into_the_figures(figures, tmp_path):
+    """Figures stay as they were measured; a list of another name is refused."""
+    (tmp_path / "notes.json").write_text('{"ladder": [{"name": "true pose", "psnr": 21.0}]}')
+    write_notes(tmp_path / "notes.json", tmp_path)
+    assert read_figures(tmp_path / page.FIGURES["foreign"]) == {
+        **figures,
+        "ladder": [{"name": "true pose", "psnr": 21}],
+    }
+    (tmp_path / "notes.json").write_text('{"rows": []}')
+    with pytest.raises(InputError, match="lists ladder and stranger alone"):
+        write_notes(tmp_path / "notes.json", tmp_path)

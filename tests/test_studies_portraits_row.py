@@ -42,8 +42,10 @@ def test_pictures_are_scored_at_the_exposure_of_their_light(truth, truth_folder,
     assert not any(name.startswith(("turned", "h3ds", "final")) for name in scores)
 
 
-def test_a_failed_fit_is_a_black_picture(truth_folder, tmp_path):
-    (tmp_path / "row.json").write_text(json.dumps({"error": "no face found"}))
+@pytest.mark.parametrize("file", ["row.json", "pictures.json"])
+def test_a_failed_fit_is_a_black_picture(truth_folder, tmp_path, file):
+    (tmp_path / "row.json").write_text(json.dumps({"cpu_seconds": 1.0}))
+    (tmp_path / file).write_text(json.dumps({"key": "", "result": {"error": "no face found"}}))
     scores = score_portrait(truth_folder, tmp_path, EXPOSURES)
     assert {scores[f"{name}_missed"] for name in VIEWS} == {1}
     assert scores["turned_left_psnr"] < 20 and "h3ds_face_mean" not in scores

@@ -51,7 +51,7 @@ from studies.portraits.visible_surface import (
 )
 
 REGIONS = ("face", "face_all", "ears", "head", "seen", "hidden")
-EARS = ((-0.8, 0.0, -0.15), (0.8, 0.0, -0.15))  # scene units, in the subject's own frame
+EARS = ((-0.85, 0.08, -0.2), (0.85, 0.08, -0.2))  # scene units, in the subject's own frame
 EAR_RADIUS = 45.0  # mm
 DIRECTIONS = ("truth_to_prediction", "prediction_to_truth")
 

@@ -37,13 +37,13 @@ def score_portrait(
 
     `VIEW_SCORE` of `relit_scores.score_view` for every VIEW.exr that is there: linear radiance [H, W, 3] under the
     environment as it is, at the pixels of the truth; its alpha, where it has one, is the coverage, else every pixel
-    that is not black is covered. Where `row.json` has an `error`, views that are not there count as black. Where there
-    is `avatar/avatar.json`, also the scores of `geometry_scores.score_geometry`, `appearance_scores.score_appearance`
-    and `score_tone`; where there is `head.npz` instead (`vertices`, `faces`, `landmarks`, `K`, `world_to_camera`: a
-    head without an appearance), those of its geometry. What is absent has no scores. Raises InputError for files that
-    are damaged or of another size than the photo."""
+    that is not black is covered. Where the row has failed, views that are not there count as black. Where there is
+    `avatar/avatar.json`, also the scores of `geometry_scores.score_geometry`, `appearance_scores.score_appearance` and
+    `score_tone`; where there is `head.npz` instead (`vertices`, `faces`, `landmarks`, `K`, `world_to_camera`: a head
+    without an appearance), those of its geometry. What is absent has no scores. Raises InputError for files that are
+    damaged or of another size than the photo."""
     truth, surface, views = _load_true_portrait(truth_folder)
-    failed = (row_folder / "row.json").exists() and "error" in read_json(row_folder / "row.json", "record of a row")
+    failed = has_failed(row_folder)
     scores: dict[str, float] = {}
     for name, view in views.items():
         picture = row_folder / f"{name}.exr"
@@ -62,6 +62,16 @@ def score_portrait(
     elif (row_folder / "head.npz").exists():
         scores |= score_geometry(_read_head(row_folder / "head.npz", *truth.mask.shape), truth, surface)
     return scores
+
+
+def has_failed(row_folder: Path) -> bool:
+    """Whether `row.json` or `pictures.json` of a row has an `error`."""
+    for name in ("row.json", "pictures.json"):
+        if (row_folder / name).exists():
+            said = read_json(row_folder / name, "record of a row")
+            if "error" in said or "error" in said.get("result", {}):
+                return True
+    return False
 
 
 @lru_cache(maxsize=1)
