@@ -42,7 +42,7 @@ def score_portrait(
     `score_tone`; where there is `head.npz` instead (`vertices`, `faces`, `landmarks`, `K`, `world_to_camera`: a head
     without an appearance), those of its geometry. What is absent has no scores. Raises InputError for files that are
     damaged or of another size than the photo."""
-    truth, surface, views = _load_true_portrait(truth_folder)
+    truth, views = _load_true_portrait(truth_folder)
     failed = has_failed(row_folder)
     scores: dict[str, float] = {}
     for name, view in views.items():
@@ -57,10 +57,11 @@ def score_portrait(
         scores |= {f"{name}_{score}": value for score, value in found.items()}
     if (row_folder / "avatar" / "avatar.json").exists():
         head, appearance = read_avatar(row_folder / "avatar", prior, *truth.mask.shape)
-        scores |= score_geometry(head, truth, surface) | score_appearance(appearance, truth)
+        scores |= score_geometry(head, truth, _find_true_surface(truth_folder)) | score_appearance(appearance, truth)
         scores |= score_tone(appearance, truth, views[next(iter(VIEWS))].face)
     elif (row_folder / "head.npz").exists():
-        scores |= score_geometry(_read_head(row_folder / "head.npz", *truth.mask.shape), truth, surface)
+        head = _read_head(row_folder / "head.npz", *truth.mask.shape)
+        scores |= score_geometry(head, truth, _find_true_surface(truth_folder))
     return scores
 
 
@@ -75,13 +76,19 @@ def has_failed(row_folder: Path) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _load_true_portrait(folder: Path) -> tuple[Truth, TrueSurface, dict[str, TrueView]]:
+def _load_true_portrait(folder: Path) -> tuple[Truth, dict[str, TrueView]]:
     """Kept for the next row of the same portrait."""
     truth, views = load_truth(folder / "truth.npz"), load_views(folder)
     for name, view in views.items():
         if view.mask.shape != truth.mask.shape:
             raise InputError(f"{folder}: {name} is not of the photo's size; build the benchmark again")
-    return truth, true_surface(truth), views
+    return truth, views
+
+
+@lru_cache(maxsize=1)
+def _find_true_surface(folder: Path) -> TrueSurface:
+    """Kept likewise; pictures alone do not need it."""
+    return true_surface(_load_true_portrait(folder)[0])
 
 
 def read_avatar(folder: Path, prior: Path, height: int, width: int) -> tuple[PredictedHead, PredictedAppearance]:
