@@ -107,6 +107,16 @@ def test_a_fit_is_compared_with_the_better_mean_head(figures):
     assert draft["mean"]["above_mean_head"] == pytest.approx(1 / 3, abs=1e-4)
 
 
+def test_rows_are_compared_with_the_draft_on_the_portraits_that_both_have(figures):
+    """The draft lacks the brightest portrait, and the mean head has no pictures."""
+    assert figures["rows"]["photo"]["to_draft"]["relit_psnr"] == -5
+    assert figures["rows"]["mean-head-2"]["to_draft"]["relit_psnr"] is None
+    assert figures["rows"]["mean-head-2"]["to_draft"]["h3ds_face_mean"] == pytest.approx(
+        (-0.2 + 0.2 + 0.4) / 3, abs=1e-4
+    )
+    assert figures["rows"]["draft"]["to_draft"]["relit_ssim"] == 0
+
+
 def test_the_darkest_fifth_and_the_groups_are_by_themselves(figures):
     photo = figures["rows"]["photo"]
     assert photo["darkest"]["relit_psnr"] == 16 and photo["darkest"]["relit_hair_psnr"] is None
@@ -125,8 +135,8 @@ def test_the_page_has_a_line_for_each_row_that_was_measured(figures):
     """A row appears in the tables of what it has; a score that it lacks is a dash."""
     text = page.render_page(figures, None)
     assert "5 portraits of 3 people" in text
-    assert "| the photo unchanged | 5 | 17.0 | 0.500 | 0.300 | – | 16.0 | 0.500 | 0.300 | – |" in text
-    assert "| mean head | 5 | 2.00 | – | – | 1.07 | 1.25 | 40 |" in text
+    assert "| the photo unchanged | 5 | 17.0 | 0.500 | 0.300 | 16.0 | 0.500 | 0.300 | -5.0 | 0.000 |" in text
+    assert "| mean head | 5 | 2.00 | 1.07 | 1.25 | 40 | – | 0.900 |" in text
     assert text.count("| mean head |") == 3 and "| second mean head |" in text  # face by group, geometry, cost
     assert "| p1 | draft | no face found |" in text
     assert "light (3)" in text and "The ladder" not in text and "## Pictures" not in text

@@ -33,16 +33,19 @@ def _scores(statistic: str, *columns: tuple) -> tuple[Column, ...]:
     return tuple(Column(title, (statistic, score), *digits) for title, score, *digits in columns)
 
 
-HEADLINE = _scores(
-    "mean",
-    ("relit, dB", "relit_psnr", 1),
-    ("SSIM", "relit_ssim", 3),
-    ("ꟻLIP", "relit_flip", 3),
-    ("scaled, dB", "relit_scaled_psnr", 1),
-    ("turned, dB", "turned_psnr", 1),
-    ("SSIM", "turned_ssim", 3),
-    ("ꟻLIP", "turned_flip", 3),
-    ("scaled, dB", "turned_scaled_psnr", 1),
+HEADLINE = (
+    *_scores(
+        "mean",
+        ("relit, dB", "relit_psnr", 1),
+        ("SSIM", "relit_ssim", 3),
+        ("ꟻLIP", "relit_flip", 3),
+        ("scaled, dB", "relit_scaled_psnr", 1),
+        ("turned, dB", "turned_psnr", 1),
+        ("SSIM", "turned_ssim", 3),
+        ("ꟻLIP", "turned_flip", 3),
+        ("scaled, dB", "turned_scaled_psnr", 1),
+    ),
+    *_scores("to_draft", ("to draft, dB", "relit_psnr", 1), ("SSIM", "relit_ssim", 3)),
 )
 TAILS = tuple(
     column
@@ -98,6 +101,7 @@ APPEARANCE = (
         ("bias", "tone_bias"),
         ("its size", "tone_bias_size"),
     ),
+    *(Column(f"bias, {tone}", ("by", "tone", tone, "tone_bias")) for tone in ("dark", "medium", "light")),
     *(Column(f"ITA, {tone}", ("by", "tone", tone, "tone_ita_error"), 0) for tone in ("dark", "medium", "light")),
     *_scores(
         "mean",
@@ -182,7 +186,9 @@ def _describe(figures: Mapping) -> str:
 
 
 def render_table(rows: Mapping[str, dict], columns: Sequence[Column]) -> str:
-    """A line for each of the figures' `rows` that has one of the columns, as Markdown."""
+    """A line for each of the figures' `rows` that has one of the columns, as Markdown. Columns that no row
+    has are left out."""
+    columns = [c for c in columns if any(find(row, *c.path) is not None for row in rows.values())]
     lines = []
     for row in rows.values():
         values = [find(row, *column.path) for column in columns]

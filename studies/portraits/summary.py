@@ -8,6 +8,7 @@ import numpy as np
 from studies.portraits.relit_scores import PARTS, SHARES
 
 MEAN_HEAD = "mean-head"  # names of the rows that are a mean head begin with it
+REFERENCE = "draft"  # the row that all others are compared with, portrait by portrait
 COMBINED = {"relit": ("relit_1", "relit_2"), "turned": ("turned_left", "turned_right")}
 RELIT_SCORES = (
     *(f"{view}_{score}" for view in COMBINED for score in ("psnr", "ssim", "flip", "scaled_psnr")),
@@ -63,7 +64,8 @@ def summarise(rows: Sequence[dict], titles: Mapping[str, str]) -> dict:
 
     `portraits` and `identities` count; `groups` count the portraits by `tone`, `yaw`, `expression` and `hair`; `rows`
     by name, those that have been made: `title`, `count` of the portraits with scores, `mean`, `worst` and `darkest`
-    (the mean over the fifth of the portraits whose skin is darkest) of `SCORES`, means of `GROUP_SCORES` by group in
+    (the mean over the fifth of the portraits whose skin is darkest) of `SCORES`, `to_draft` (the mean of how much
+    `EACH_SCORES` are above those of the row `REFERENCE` on the same portraits), means of `GROUP_SCORES` by group in
     `by`, costs; `each` portrait: its groups and `EACH_SCORES` by row; `failed` rows with their `error`. A score that is
     NaN on a portrait does not count there; None where it is NaN on all.
 
@@ -91,6 +93,7 @@ def summarise(rows: Sequence[dict], titles: Mapping[str, str]) -> dict:
                 "mean": average(list(scored.values()), SCORES),
                 "worst": find_worst(list(scored.values()), SCORES),
                 "darkest": average([scores for portrait, scores in scored.items() if portrait in darkest], SCORES),
+                "to_draft": average(_subtract(scored, known.get(REFERENCE, {})), EACH_SCORES),
                 "by": _average_groups(scored, groups),
                 **_costs([row for row in rows if row["row"] == name]),
             }
@@ -162,6 +165,14 @@ def _combine_views(scores: Mapping[str, float]) -> dict[str, float]:
     for name in ("camera_distance_error", "tone_bias", "tone_ita_error"):
         result[f"{name}_size"] = abs(scores.get(name, math.nan))
     return result
+
+
+def _subtract(scored, reference):
+    return [
+        {name: scores.get(name, math.nan) - reference[portrait].get(name, math.nan) for name in EACH_SCORES}
+        for portrait, scores in scored.items()
+        if portrait in reference
+    ]
 
 
 def _find_mean_heads(known):
