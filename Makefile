@@ -1,12 +1,14 @@
 # make fit: photo to avatar.  make check: a minute of checks.  make test: all of them.
+# make check-fit BENCH=FOLDER: ten minutes of fits to eight portraits of a benchmark, relit and scored.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= avatar
 QUALITY ?= standard
 PHOTO ?=
+BENCH ?= bench
 
-.PHONY: install fit lint check test
+.PHONY: install fit lint check test check-fit
 
 # .installed: what a fit needs; .tools: also what tests and checks need.
 install: $(VENV)/.tools
@@ -35,3 +37,10 @@ check: lint
 
 test: lint
 	$(BIN)/python -m pytest
+
+# Anew each time, as rows do not know the code that made them.
+check-fit: install
+	rm -rf .check-fit
+	$(BIN)/python -m studies.portraits fit --benchmark "$(BENCH)" --runs .check-fit --half choice --portraits 8 \
+		--rows draft page-of-code photo --workers 2
+	$(BIN)/python -m studies.portraits score --benchmark "$(BENCH)" --runs .check-fit --half choice --portraits 8

@@ -82,6 +82,7 @@ def integrate_irradiance(environment: np.ndarray, normals: np.ndarray) -> np.nda
 
     flux, way = (sum_blocks(image * solid_angle[:, None, None]) for image in (environment, directions))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
+    flux, way, normals = (array.astype(np.float32) for array in (flux, way, normals))
     chunks = [normals[start : start + _CHUNK] for start in range(0, len(normals), _CHUNK)]
     return np.concatenate([np.maximum(chunk @ way.T, 0) @ flux for chunk in chunks] or [np.zeros((0, 3))]) / np.pi
 
