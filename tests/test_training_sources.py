@@ -325,6 +325,27 @@ def test_avatar_in_metres_keeps_its_size_and_gets_regions(person, avatar_folder)
     assert subject.name == "valid/X_White_F_7"
 
 
+@pytest.mark.slow
+def test_landmarks_of_an_expression_move_with_the_skin(avatar_folder):
+    """An avatar whose skin below the nose moves down by 5 mm: so do the landmarks there, the others stay, and so does
+    the frame. Teeth are asked of a file that has none."""
+    source = ValidSource(avatar_folder)
+    (path,) = source.files()
+    neutral = source.subject(0, 1)
+    with np.load(path) as data:
+        low = data["v"][:, 1] < 1.6 - 0.03
+        move = np.where(low[:, None], [0, -0.005, 0], 0)
+    moved = valid.make_subject(path, "moved", 1, source.licence, valid.Rendition(move))
+    assert moved.description["rotation"] == neutral.description["rotation"]
+    assert (moved.landmarks_valid == neutral.landmarks_valid).all()
+    change = (moved.landmarks - neutral.landmarks)[neutral.landmarks_valid]
+    below = change[:, 1] < -0.049
+    assert 0.1 < below.mean() < 0.7
+    assert np.median(np.linalg.norm(change[~below], axis=1)) < 0.01
+    with pytest.raises(BrokenHead, match="it has no part h_TeethUp"):
+        valid.read_avatar(path, valid.Rendition(teeth=True))
+
+
 def test_avatar_names_give_groups():
     assert find_group("NHPI_M_2") == {"ancestry": "NHPI", "sex": "male", "age": "adult"}
     assert find_group("somebody") == {"ancestry": "unknown", "sex": "unknown", "age": "adult"}

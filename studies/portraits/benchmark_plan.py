@@ -84,6 +84,7 @@ class Shot:
     half: str = "report"  # "choice": settings may be chosen on it
     rank: int = 0  # in its half, whose first portraits are a balanced set
     expression: str = "neutral"
+    variant: int = 0  # of the expression
     hair_style: str = "own"
     crop: str = "shoulders"
     background: str = "plain"  # "busy": an environment in focus; "person": a second person

@@ -7,7 +7,7 @@ crop and pose. Numbers follow Halton sequences, and choices come in shuffled rou
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -33,16 +33,20 @@ from studies.portraits.benchmark_plan import (
     name_tone,
     traits_of,
 )
+from studies.portraits.foreign_heads import ForeignHeads
 
 Item = TypeVar("Item")
 
 # All avatars; photos as phones store them.
-FOREIGN = BenchmarkSettings("foreign", identities=28, photo=PhotoSettings(jpeg_quality=85, jpeg_subsampling=2))
+FOREIGN = BenchmarkSettings(
+    "foreign", identities=28, photo=PhotoSettings(shading_samples=16, jpeg_quality=85, jpeg_subsampling=2)
+)
 HALVES = ("choice", "report")
 TAKES = 2  # portraits of each identity
 LARGEST_YAW, LARGEST_PITCH = 45.0, 15.0  # degrees
 DISTANCE = (0.4, 3.0)  # m, from the camera to the head
-EXPRESSIONS = ("neutral",)
+# A third of the portraits is neutral.
+SHOWN = ("neutral", "open_smile", "aside", "neutral", "talking", "closed_smile", "neutral", "eyes_closed", "brows")
 BACKGROUNDS = ("plain", "busy", "plain", "busy", "person")
 # The cheeks in the texture's layout, which all avatars share, as shares of its sides.
 CHEEK_ROWS, CHEEK_COLUMNS = (0.25, 0.285), ((0.24, 0.28), (0.38, 0.42))
@@ -67,31 +71,35 @@ CROPS = (
 
 
 def plan_foreign(valid: Path, morphs: Path, hair: Path, hdri: Path, settings: BenchmarkSettings) -> list[Sitting]:
-    """The portraits by rank, the halves in turns. Raises InputError for folders without avatars or with too few
-    environments."""
-    source = ValidSource(valid)
-    source.count()
+    """The portraits by rank, the halves in turns. Raises InputError for folders without avatars, their morphs or hair,
+    or with too few environments."""
+    heads = ForeignHeads(ValidSource(valid), morphs, hair)
+    heads.check()
     environments = list_environments(hdri)
-    halves = [order_identities(half) for half in split_identities(list_identities(source))]
-    heads = {name: -(-(settings.identities - k) // 2) for k, name in enumerate(HALVES)}
+    halves = [order_identities(half) for half in split_identities(list_identities(heads.avatars))]
+    numbers = {name: -(-(settings.identities - k) // 2) for k, name in enumerate(HALVES)}
     shots = [
         shot
         for name, half in zip(HALVES, halves, strict=True)
         for shot in plan_half(name, half, environments, settings.seed)
-        if shot.identity in half[: heads[name]]
+        if shot.identity in half[: numbers[name]]
     ]
     shots.sort(key=lambda shot: (shot.rank, shot.half))
     members = dict(zip(HALVES, halves, strict=True))
-    return [make_sitting(source, shot, members[shot.half]) for shot in shots]
+    return [make_sitting(heads, shot, members[shot.half]) for shot in shots]
 
 
-def make_sitting(source: ValidSource, shot: Shot, half: Sequence[Identity]) -> Sitting:
+def make_sitting(heads: ForeignHeads, shot: Shot, half: Sequence[Identity]) -> Sitting:
     """The sitting of a portrait; a second person comes from the same half."""
-    make = partial(source.subject, shot.identity.number, shot.identity.seed)
-    if shot.background != "person":
-        return Sitting(make, [shot])
-    other = half[(half.index(shot.identity) + 3) % len(half)]
-    return Sitting(make, [shot], partial(source.subject, other.number, other.seed))
+    me = shot.identity
+    make, make_beside = partial(heads.make_subject, me.number, me.seed, shot.expression, shot.variant), None
+    data = heads.files_of(me.number)
+    if shot.background == "person":
+        other = half[(half.index(me) + 3) % len(half)]
+        make_beside = partial(heads.make_subject, other.number, other.seed)
+        data += heads.files_of(other.number)
+    style = heads.style_of(me.number)
+    return Sitting(make, [replace(shot, data=tuple(data), hair_style=style)], make_beside)
 
 
 def list_identities(source: ValidSource) -> list[Identity]:
@@ -158,12 +166,16 @@ def plan_half(name: str, identities: Sequence[Identity], environments: list[Path
     count = TAKES * len(identities)
     places = Halton(3, seed=random).random(count)
     expressions, lights, extremes, backgrounds = (
-        spread(names, count, random) for names in (EXPRESSIONS, LIGHTS, EXTREMES, BACKGROUNDS)
+        spread(names, count, random) for names in (SHOWN, LIGHTS, EXTREMES, BACKGROUNDS)
     )
+    for rank in range(len(identities), count - 1):
+        if expressions[rank] == expressions[rank - len(identities)]:
+            expressions[rank : rank + 2] = expressions[rank + 1], expressions[rank]
     crops, exif = spread(CROPS, count, random), spread((True, False), count, random)
     taken = spread(environments, count, random)
     relights = draw_relights(environments, taken, draw_seed(seed, name))
     shots = []
+    shown = Counter[str]()
     for rank in range(count):
         identity, take = identities[rank % len(identities)], rank // len(identities)
         distance = float(DISTANCE[0] * (DISTANCE[1] / DISTANCE[0]) ** places[rank, 2])
@@ -184,11 +196,13 @@ def plan_half(name: str, identities: Sequence[Identity], environments: list[Path
                 half=name,
                 rank=rank,
                 expression=expression,
+                variant=shown[expression] + 3 * HALVES.index(name),
                 crop=crop.name,
                 background=backgrounds[rank],
                 exif=exif[rank],
             )
         )
+        shown[expression] += 1
     return shots
 
 

@@ -83,26 +83,27 @@ class Marks:
 
 
 @cache
-def _mean_control():
+def mean_control() -> np.ndarray:
+    """Base-mesh vertices [19158, 3] of the MakeHuman head of average age, sex and ancestry, scene units."""
     share = 1 / len(ANCESTRIES)
     return identity_vertices(Identity(40.0, 0.5, (share,) * len(ANCESTRIES), 0.5, 0.5, 0.4, {}))
 
 
 def mean_eyes() -> np.ndarray:
     """The middle [3] between the mean head's eyes, scene units."""
-    return np.mean([centre for centre, _ in eye_spheres(_mean_control())], axis=0)
+    return np.mean([centre for centre, _ in eye_spheres(mean_control())], axis=0)
 
 
 @cache
 def mean_head() -> tuple[np.ndarray, np.ndarray]:
     """Landmarks [468, 3] in scene units and validity [468] of the MakeHuman head of average age, sex and ancestry."""
-    return mesh_landmarks(head_surface(_mean_control())[0])
+    return mesh_landmarks(head_surface(mean_control())[0])
 
 
 @cache
 def _mean_normals():
     """Unit normals [468, 3] at the mean head's landmarks."""
-    head, triangles = head_surface(_mean_control())
+    head, triangles = head_surface(mean_control())
     normals = mesh_landmarks(vertex_normals(head, triangles))[0]
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 

@@ -87,8 +87,9 @@ def dress(control: np.ndarray, traits: Traits, random: np.random.Generator, hair
     head, triangles, cloth = skin.dress_head(control, look)
     volume = None
     covered = np.zeros(len(head))
-    if cut is not None:
-        volume, covered = _wear(cut, hair_folder, control, head, look, random)
+    if cut is not None and hair_folder is not None:
+        volume = make_hair(cut, hair_folder, control, np.array(look.hair_colour), random)
+        covered = skin.step(cKDTree(volume.vertices).query(head)[0], 0.16, 0.08) * skin.scalp_mask()
     albedo, specular = skin.paint_head(look, cloth, covered)
     region = np.where(cloth[triangles].mean(1) > 0.5, skin.CLOTH, skin.SKIN)
     parts = [Part(head, triangles, vertex_normals(head, triangles), albedo, specular, region)]
@@ -102,8 +103,8 @@ def dress(control: np.ndarray, traits: Traits, random: np.random.Generator, hair
     return Person(traits, look, cut, control, head, parts)
 
 
-def _wear(cut, folder, control, head, look, random):
-    """The hair part, and the share of each head vertex [M] that lies under it."""
+def make_hair(cut: Cut, folder: Path, control: np.ndarray, colour: np.ndarray, random: np.random.Generator) -> Part:
+    """The hair of a cut, of about a colour [3], on a head given by its base-mesh vertices [19158, 3]."""
     mesh = hairs.read_hair(folder, cut.name)
     fitted = hairs.fit_hair(mesh, control)
     fitted = fitted * [1, cut.volume, cut.volume] if cut.volume < 1 else fitted * cut.volume
@@ -122,8 +123,8 @@ def _wear(cut, folder, control, head, look, random):
     vertices = vertices + np.clip(relief, -0.05, 0.05)[:, None] * normals
     normals = vertex_normals(vertices, triangles)
     shade = np.exp(0.22 * fine + 0.2 * coarse + 0.08 * waves)
-    albedo = np.clip(np.array(look.hair_colour) * shade[:, None], 0.004, 0.9)
-    part = Part(
+    albedo = np.clip(colour * shade[:, None], 0.004, 0.9)
+    return Part(
         vertices,
         triangles,
         normals,
@@ -131,6 +132,3 @@ def _wear(cut, folder, control, head, look, random):
         np.full(len(vertices), HAIR_SPECULAR),
         np.full(len(triangles), skin.HAIR),
     )
-    distance, _ = cKDTree(vertices).query(head)
-    covered = skin.step(distance, 0.16, 0.08) * skin.scalp_mask()
-    return part, covered

@@ -45,10 +45,10 @@ def smooth_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return vertex_normals(places, index[triangles])[index]
 
 
-def decode_texture(image: np.ndarray) -> np.ndarray:
-    """Linear [H, W, 3] of an 8-bit sRGB image, reduced to at most `TEXTURE_SIDE` pixels a side."""
+def decode_texture(image: np.ndarray, side: int = TEXTURE_SIDE) -> np.ndarray:
+    """Linear [H, W, 3] of an 8-bit sRGB image, reduced to at most `side` pixels a side."""
     linear = srgb_to_linear(image[..., :3].astype(np.float32) / 255)
-    scale = TEXTURE_SIDE / max(linear.shape[:2])
+    scale = side / max(linear.shape[:2])
     if scale < 1:
         size = (max(1, round(linear.shape[1] * scale)), max(1, round(linear.shape[0] * scale)))
         linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)

@@ -6,6 +6,7 @@ before it for some. Heads keep their natural size.
 """
 
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,14 +34,22 @@ from sira_mi.training.collection.render import Part
 from sira_mi.training.collection.similarity import Similarity
 from sira_mi.training.collection.sources.meshes import LARGEST_TEXTURE, MOST_TRIANGLES
 from sira_mi.training.collection.subject import BrokenHead, Subject
-from sira_mi.training.collection.textured_surface import Surface, close_borders, decode_texture, refine, sample_texture
-from sira_mi.training.collection.triangles import draw_barycentric, triangle_areas, vertex_normals
+from sira_mi.training.collection.textured_surface import (
+    TEXTURE_SIDE,
+    Surface,
+    close_borders,
+    decode_texture,
+    refine,
+    sample_texture,
+)
+from sira_mi.training.collection.triangles import draw_barycentric, find_nearest, triangle_areas, vertex_normals
 
 UNITS_PER_METRE = 10.0
 LARGEST_ARRAYS = 128 * 2**20  # bytes unpacked
 ARRAYS = ("v", "f", "uv", "part", "part_names", "eye_l", "eye_r")
 BODY, WIG = "H_DDS_HighRes", "h_wig"
 EYES, GLANDS = ("h_L_eye", "h_R_eye"), ("h_L_gland", "h_R_gland")
+TEETH = ("h_TeethUp", "h_TeethDown")  # with the tongue
 EYE_EDGE = 0.012  # scene units, longest edge of eyes and glands
 # Scene units from the middle over which the arms, which are stretched out sideways, start to turn down, and how far.
 ARM_START, ARM_END, ARM_TURN = 1.15, 2.05, 0.95
@@ -70,47 +79,81 @@ class ValidSource:
         return f"{self.name}/{self.files()[number].stem}"
 
     def subject(self, number: int, seed: int) -> Subject:
-        path = self.files()[number]
-        random = np.random.default_rng([seed, 31])
-        surfaces, eyes = read_avatar(path)
-        rough = Similarity(UNITS_PER_METRE, np.eye(3), mean_eyes() - UNITS_PER_METRE * eyes)
-        surfaces = {name: replace(s, vertices=rough(s.vertices)) for name, s in surfaces.items()}
-        body = replace(surfaces[BODY], vertices=lower_arms(surfaces[BODY].vertices))
-        body = refine(close_borders(body, mean_eyes()[1] - 1.2), choose_edge_lengths)
-        small = {n: refine(surfaces[n], lambda m: np.full(len(m), EYE_EDGE)) for n in EYES + GLANDS}
-        parts = [
-            make_plain_part(body),
-            *(make_plain_part(small[n], skin.EYE if n in EYES else skin.SKIN) for n in small),
-        ]
-        wig = build_wig(surfaces[WIG], random) if WIG in surfaces else None
-        still = Similarity(1.0, np.eye(3), np.zeros(3))
-        frame, landmarks, valid, spread = find_frame([*parts, *([wig] if wig else [])], still, natural_size=True)
-        marks = fill_missing_landmarks(landmarks, valid)
+        return make_subject(self.files()[number], self.title(number), seed, self.licence)
 
-        body = replace(body, vertices=frame(body.vertices))
-        colours = body.colours()
-        scale, base = find_albedo_scale(body.vertices, colours, marks), draw_skin_specular(seed)
-        region = classify(body.vertices, body.triangles, colours, marks)
-        head = paint_part(body, region, marks, scale, base)
-        others = frame.move(parts[1:])
-        others = [replace(part, albedo=np.clip(part.albedo * scale, 0.004, 0.9)) for part in others]
-        if wig is not None:
-            (wig,) = frame.move([wig])
-            wig = replace(wig, albedo=np.clip(wig.albedo * scale, 0.004, 0.9))
-            head = _shade_scalp(head, wig, region, marks)
-            others.append(wig)
-        description = {
-            "file": path.name,
-            "rotation": frame.rotation.tolist(),
-            "shift": frame(rough.shift).tolist(),
-            "albedo_scale": scale,
-            "specular": base,
-            "wig": wig is not None,
-            "landmark_spread_mm": float(np.nanmedian(spread)),
-        }
-        return Subject(
-            self.title(number), [head, *others], landmarks, valid, find_group(path.stem), description, self.licence
-        )
+
+@dataclass(frozen=True)
+class Rendition:
+    """How an avatar is made into a subject."""
+
+    move: np.ndarray | None = None  # [N, 3] metres by which an expression moves the vertices of the avatar's file
+    teeth: bool = False  # whether teeth and tongue are parts
+    texture_side: int = TEXTURE_SIDE  # pixels that textures are reduced to
+    choose_edges: Callable[[np.ndarray], np.ndarray] = choose_edge_lengths  # of the body, as for `refine`
+
+
+def make_subject(path: Path, name: str, seed: int, licence: str, rendition: Rendition | None = None) -> Subject:
+    """The subject of an avatar's file, with a look drawn from `seed`. With an expression, its frame is that of the
+    neutral avatar, and its landmarks move with the skin. Raises `BrokenHead` when it cannot be used."""
+    rendition = rendition or Rendition()
+    random = np.random.default_rng([seed, 31])
+    neutral = rendition if rendition.move is None else Rendition()
+    surfaces, eyes = read_avatar(path, neutral)
+    rough = Similarity(UNITS_PER_METRE, np.eye(3), mean_eyes() - UNITS_PER_METRE * eyes)
+    wig = build_wig(place(surfaces[WIG], rough), random) if WIG in surfaces else None
+    plain = place(surfaces[BODY], rough)
+    body, parts = build_parts(surfaces, rough, neutral)
+    still = Similarity(1.0, np.eye(3), np.zeros(3))
+    frame, landmarks, valid, spread = find_frame([*parts, *([wig] if wig else [])], still, natural_size=True)
+    if rendition.move is not None:
+        surfaces, _ = read_avatar(path, rendition)
+        body, parts = build_parts(surfaces, rough, rendition)
+        moved = frame(place(surfaces[BODY], rough).vertices)
+        feet = find_nearest(landmarks, None, frame(plain.vertices), plain.triangles)[0]
+        landmarks = np.where(valid[:, None], feet.matrix(plain.triangles, len(moved)) @ moved, 0)
+    marks = fill_missing_landmarks(landmarks, valid)
+
+    body = replace(body, vertices=frame(body.vertices))
+    colours = body.colours()
+    scale, base = find_albedo_scale(body.vertices, colours, marks), draw_skin_specular(seed)
+    region = classify(body.vertices, body.triangles, colours, marks)
+    head = paint_part(body, region, marks, scale, base)
+    others = frame.move(parts[1:])
+    others = [replace(part, albedo=np.clip(part.albedo * scale, 0.004, 0.9)) for part in others]
+    if wig is not None:
+        (wig,) = frame.move([wig])
+        wig = replace(wig, albedo=np.clip(wig.albedo * scale, 0.004, 0.9))
+        head = shade_scalp(head, wig, region, marks)
+        others.append(wig)
+    description = {
+        "file": path.name,
+        "rotation": frame.rotation.tolist(),
+        "shift": frame(rough.shift).tolist(),
+        "albedo_scale": scale,
+        "specular": base,
+        "wig": wig is not None,
+        "landmark_spread_mm": float(np.nanmedian(spread)),
+    }
+    return Subject(name, [head, *others], landmarks, valid, find_group(path.stem), description, licence)
+
+
+def place(surface: Surface, rough: Similarity) -> Surface:
+    """A surface of an avatar in the project's frame."""
+    return replace(surface, vertices=rough(surface.vertices))
+
+
+def build_parts(surfaces: dict[str, Surface], rough: Similarity, rendition: Rendition) -> tuple[Surface, list[Part]]:
+    """The refined body in the project's frame, and it and the small surfaces as parts without a wig."""
+    body = place(surfaces[BODY], rough)
+    body = replace(body, vertices=lower_arms(body.vertices))
+    body = refine(close_borders(body, mean_eyes()[1] - 1.2), rendition.choose_edges)
+    parts = [make_plain_part(body)]
+    for name in EYES + GLANDS + (TEETH if rendition.teeth else ()):
+        small = place(surfaces[name], rough)
+        if name not in TEETH:
+            small = refine(small, lambda middle: np.full(len(middle), EYE_EDGE))
+        parts.append(make_plain_part(small, skin.EYE if name in EYES else skin.SKIN))
+    return body, parts
 
 
 def find_group(stem: str) -> dict[str, str]:
@@ -121,7 +164,7 @@ def find_group(stem: str) -> dict[str, str]:
     return {"ancestry": ancestry, "sex": sex, "age": "adult"}
 
 
-def read_avatar(path: Path) -> tuple[dict[str, Surface], np.ndarray]:
+def read_avatar(path: Path, rendition: Rendition) -> tuple[dict[str, Surface], np.ndarray]:
     """The surfaces of an avatar by part name, in metres, and the middle [3] between its eyes.
 
     Raises BrokenHead with the reason when its files are damaged or incomplete."""
@@ -146,24 +189,28 @@ def read_avatar(path: Path) -> tuple[dict[str, Surface], np.ndarray]:
     eyes = (arrays["eye_l"] + arrays["eye_r"]) / 2
     if eyes.shape != (3,) or not all(np.isfinite(a).all() for a in (v, uv, eyes)):
         raise BrokenHead("its arrays are not finite")
-    missing = [name for name in (BODY, *EYES, *GLANDS) if name not in names]
+    needed = (BODY, *EYES, *GLANDS, *(TEETH if rendition.teeth else ()))
+    missing = [name for name in needed if name not in names]
     if missing:
         raise BrokenHead(f"it has no part {missing[0]}")
-    painted = read_texture(path.with_name(f"{path.stem}.jpg"))
-    surfaces = {name: _surface(v, f[part == names.index(name)], uv, painted) for name in (BODY, *EYES, *GLANDS)}
+    if rendition.move is not None:
+        v = v + rendition.move
+    painted = read_texture(path.with_name(f"{path.stem}.jpg"), rendition.texture_side)
+    surfaces = {name: _surface(v, f[part == names.index(name)], uv, painted) for name in needed}
     if WIG in names:
-        strands = read_texture(path.with_name(f"{path.stem}_wig.jpg"))
+        strands = read_texture(path.with_name(f"{path.stem}_wig.jpg"), rendition.texture_side)
         surfaces[WIG] = _surface(v, f[part == names.index(WIG)], uv, strands)
     return surfaces, eyes.astype(float)
 
 
-def read_texture(path: Path) -> np.ndarray:
-    """Linear [H, W, 3] of an image file. Raises BrokenHead when it cannot be read."""
+def read_texture(path: Path, side: int = TEXTURE_SIDE) -> np.ndarray:
+    """Linear [H, W, 3] of an image file, reduced to at most `side` pixels a side. Raises BrokenHead when it cannot be
+    read."""
     try:
         with Image.open(path) as image:
             if max(image.size) > LARGEST_TEXTURE:
                 raise BrokenHead(f"{path.name} has {image.size[0]}×{image.size[1]} pixels")
-            return decode_texture(np.asarray(image.convert("RGB")))
+            return decode_texture(np.asarray(image.convert("RGB")), side)
     except (OSError, SyntaxError) as error:
         raise BrokenHead(f"{path.name} cannot be read ({error})") from None
 
@@ -223,8 +270,8 @@ def scatter(surface: Surface, spacing: float, random: np.random.Generator) -> tu
     return np.einsum("sk,skd->sd", bary, corners[triangle]), np.einsum("sk,skd->sd", bary, texture)
 
 
-def _shade_scalp(head, wig, region, landmarks):
-    """The head with the wig's colour on the scalp beneath and right beside it."""
+def shade_scalp(head: Part, wig: Part, region: np.ndarray, landmarks: np.ndarray) -> Part:
+    """The head, with region codes [N] of its vertices, with the wig's colour on the scalp beneath and beside it."""
     distance, near = cKDTree(wig.vertices).query(head.vertices, distance_upper_bound=0.17)
     near = np.minimum(near, len(wig.vertices) - 1)
     covered = skin.step(distance, 0.16, 0.06) * (region != skin.CLOTH) * ~face_mask(head.vertices, landmarks)
