@@ -65,7 +65,7 @@ class Crop:
 CROPS = (
     Crop("shoulders", (4.4, 5.2), None),
     Crop("head", (3.2, 3.8), None),
-    Crop("half", (5.6, 6.4), None, nearest=0.8),
+    Crop("half", (5.2, 5.6), None, nearest=0.8),
     Crop("face", (2.3, 2.7), (-0.2, 0.05)),
 )
 
