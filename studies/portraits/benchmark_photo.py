@@ -22,6 +22,7 @@ NOTHING = 255  # region code of pixels off the person
 ROUGHNESS = {SKIN: (0.35, 0.55), HAIR: (0.3, 0.5), EYE: (0.05, 0.2), CLOTH: (0.7, 0.9)}
 FILM_DIAGONAL = 43.2666  # mm, of the 36 mm x 24 mm frame
 ABOVE = 0.35  # scene units between the highest hair and the upper edge of the photo
+NOISE_STEP = 0x9E3779B1  # between the seeds of one picture with other noise
 LANES = 4_000_000  # paths a launch
 JPEG_QUALITY = 95
 
@@ -34,6 +35,7 @@ class PhotoSettings:
     depth: int = 6  # path length, bounces
     shading_samples: int = 64  # directions a pixel, of the truth's shading and shadow; a power of four
     specular_step: float = 0.05  # specular strengths are rounded to its multiples; 0.004 of reflectance
+    noise: int = 0  # another number gives the same pictures with other noise
     jpeg_quality: int = JPEG_QUALITY
     jpeg_subsampling: int = 0  # of the colours: 0 for 4:4:4, 2 for 4:2:0
 
@@ -287,7 +289,7 @@ class View:
             per_launch //= 2
         sampler = mi.load_dict({"type": "ldsampler", "sample_count": samples})
         sampler.set_samples_per_wavefront(per_launch)
-        sampler.seed(seed, count * per_launch)
+        sampler.seed((seed + NOISE_STEP * self.settings.noise) % 2**32, count * per_launch)
         chosen = mi.UInt32(pixels.astype(np.uint32))
         total: np.ndarray | float = 0.0
         for _ in range(samples // per_launch):

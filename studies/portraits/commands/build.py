@@ -32,13 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--portraits", type=int, metavar="N", help="foreign: the first N, from both halves in turns")
     parser.add_argument("--size", type=int, default=512, metavar="N", help="of a photo, pixels (default: 512)")
     parser.add_argument("--samples", type=int, default=256, metavar="N", help="paths a pixel, a power of 4")
+    parser.add_argument("--view-samples", type=int, default=64, metavar="N", help="the same of relit and turned views")
+    parser.add_argument("--noise", type=int, default=0, metavar="N", help="other numbers give other noise")
     parser.add_argument("--workers", type=int, default=1, help="processes")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Builds the benchmark that the command line describes and prints a summary."""
     from studies.portraits.benchmark import build_benchmark
-    from studies.portraits.benchmark_photo import PhotoSettings
     from studies.portraits.benchmark_plan import BenchmarkSettings, plan_own, select_sources
     from studies.portraits.foreign_plan import FOREIGN, plan_foreign
 
@@ -47,8 +48,10 @@ def run(arguments: argparse.Namespace) -> None:
             raise InputError(f"--{name} must be at least 1")
     if not 64 <= arguments.size <= 4096:
         raise InputError("--size must be 64 to 4096 pixels")
-    if arguments.samples not in (1, 4, 16, 64, 256, 1024):
-        raise InputError("--samples must be a power of 4 up to 1024")
+    if not {arguments.samples, arguments.view_samples} <= {1, 4, 16, 64, 256, 1024}:
+        raise InputError("--samples and --view-samples must be powers of 4 up to 1024")
+    if arguments.noise < 0:
+        raise InputError("--noise must not be negative")
     if missing := [name for name in NEEDED[arguments.kind] if getattr(arguments, name) is None]:
         raise InputError(f"--kind {arguments.kind} needs --{missing[0]}")
     start = time.monotonic()
@@ -62,7 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
             settings.photo,
             size=arguments.size,
             samples=arguments.samples,
-            view_samples=min(arguments.samples, PhotoSettings.view_samples),
+            view_samples=arguments.view_samples,
+            noise=arguments.noise,
         ),
     )
     if settings.kind == "foreign":
