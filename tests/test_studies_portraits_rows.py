@@ -30,7 +30,6 @@ from studies.portraits.make_rows import make_row, run_measured
 from studies.portraits.page_of_code import (
     divide_by_shading,
     evaluate_harmonics,
-    find_face,
     integrate_irradiance,
     shade,
 )
@@ -61,17 +60,16 @@ def environment(lean: np.ndarray, rows: int = 64) -> np.ndarray:
 
 
 def test_division_by_the_shading_gives_the_albedo_back():
-    """A ball of one albedo under a light of nine harmonics, in the middle that the light is fitted to; times its own
-    shading it is the photo again."""
+    """A ball of one albedo under a light of nine harmonics, up to the damping of the fit; times its own shading it is
+    the photo again."""
     normals, inside = ball()
     light = np.array([1.0, 0.2, 0.3, 0.35, 0.05, -0.05, 0.1, 0.05, 0.05])[:, None] * [1.0, 0.9, 0.7]
     shading = evaluate_harmonics(normals) @ light
     photo = np.where(inside[..., None], SKIN * shading, 0)
-    albedo = divide_by_shading(photo, normals, inside, SKIN)
-    middle = find_face(inside)
-    assert middle.sum() > 100
-    np.testing.assert_allclose(albedo[middle], np.broadcast_to(SKIN, albedo[middle].shape), rtol=0.02)
-    np.testing.assert_allclose((albedo * shading)[middle], photo[middle], rtol=0.02)
+    albedo = divide_by_shading(photo, normals, inside, inside, SKIN)
+    seen = normals[..., 2] > 0.4
+    np.testing.assert_allclose(albedo[seen], np.broadcast_to(SKIN, albedo[seen].shape), rtol=0.03)
+    np.testing.assert_allclose((albedo * shading)[seen], photo[seen], rtol=0.03)
     assert not albedo[~inside].any()
 
 
@@ -80,7 +78,7 @@ def test_marks_on_the_skin_are_albedo_and_do_not_change_the_light():
     normals, inside = ball()
     photo = np.where(inside[..., None], SKIN * (0.6 + 0.4 * normals[..., 2:]), 0)
     photo[20:23, 18:30] *= 0.3
-    albedo = divide_by_shading(photo, normals, inside, SKIN)
+    albedo = divide_by_shading(photo, normals, inside, inside, SKIN)
     np.testing.assert_allclose(albedo[20:23, 18:30], np.broadcast_to(0.3 * SKIN, (3, 12, 3)), rtol=0.05)
     np.testing.assert_allclose(albedo[30, 24], SKIN, rtol=0.03)
 
@@ -92,9 +90,9 @@ def test_irradiance_is_that_of_the_light():
     expected = np.repeat(1 + 2 / 3 * (normals[inside] @ lean)[:, None], 3, axis=1)
     np.testing.assert_allclose(integrate_irradiance(light, normals[inside]), expected, rtol=2e-3)
     photo = shade(SKIN, normals, inside, light)
-    again = shade(divide_by_shading(photo, normals, inside, SKIN), normals, inside, light)
-    middle = find_face(inside)
-    np.testing.assert_allclose(again[middle], photo[middle], rtol=0.02)
+    again = shade(divide_by_shading(photo, normals, inside, inside, SKIN), normals, inside, light)
+    seen = normals[..., 2] > 0.4
+    np.testing.assert_allclose(again[seen], photo[seen], rtol=0.04)
 
 
 # A benchmark of eggs

@@ -24,6 +24,7 @@ from sira_mi.portrait.camera import Camera, yaw_rotation
 from sira_mi.portrait.load import load_photo
 from sira_mi.sg.lights_io import read_environment
 from sira_mi.training.collection.skin import SKIN
+from studies.measures import SHOULDERS
 from studies.portraits.page_of_code import MEAN_SKIN, divide_by_shading, shade
 from studies.portraits.photo_frame import PhotoFrame, read_frame
 from studies.portraits.relit_lights import exposure_of
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 # Views that the photo itself shows the head in.
 UNTURNED = {view: light for view, (light, yaw) in VIEWS.items() if yaw == 0}
 
+MIDDLE = 60.0  # mm around the nose: from the brows to the chin, where a face is mostly skin
+
 
 @dataclass(frozen=True, eq=False)
 class Head:
@@ -43,6 +46,12 @@ class Head:
     vertices: np.ndarray  # [N, 3] scene units
     faces: np.ndarray  # [T, 3]
     camera: Camera  # at the photo's pixels
+
+    @property
+    def nose(self) -> np.ndarray:
+        """The foremost vertex above the shoulders, [3]."""
+        above = self.vertices[self.vertices[:, 1] > SHOULDERS]
+        return above[np.argmax(above[:, 2])]
 
     def draw(self, yaw_degrees: float = 0.0) -> MeshImages:
         """Mask and normals of the head turned to its left."""
@@ -86,7 +95,10 @@ def relight_photo(
 ) -> dict[str, np.ndarray]:
     """For each view that is not turned, the photo over its shading, times that of the view's light."""
     seen = head.draw()
-    albedo = divide_by_shading(photo, seen.normal, seen.mask, colour)
+    face = np.linalg.norm(seen.position - head.nose, axis=2) * MILLIMETRES_PER_UNIT < MIDDLE
+    if not face.any():
+        raise InputError("the photo does not show the middle of the face of the head")
+    albedo = divide_by_shading(photo, seen.normal, seen.mask, face, colour)
     return {view: shade(albedo, seen.normal, seen.mask, environments[light]) for view, light in UNTURNED.items()}
 
 

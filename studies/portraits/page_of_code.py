@@ -1,7 +1,7 @@
 """Relighting by a page of code, which a fit must beat: the photo divided by a smooth shading, times another light's.
 
 The shading is nine spherical harmonics of the normal, as diffuse reflection of distant light nearly is (Ramamoorthi and
-Hanrahan 2001), fitted robustly to the middle of the face as if all of its skin had one colour. What it does not explain
+Hanrahan 2001), fitted robustly to the face as if all of its skin had one colour. What it does not explain
 is taken for albedo. There are no shadows and no highlights, and only what the photo shows can be relit.
 """
 
@@ -12,8 +12,6 @@ from sira_mi.sg.fit_environment import pixel_directions
 MEAN_SKIN = np.exp([-0.695, -1.139, -1.453])  # linear albedo: the mean of the logarithms of measured skin
 LARGEST_ALBEDO = 1.2
 _DARKEST = 0.05  # least shading, times the median on the face
-# Of the middle of the face in what is seen of a person: quantiles of rows and columns.
-_HEAD, _COLUMNS, _ROWS = 0.45, (0.25, 0.75), 0.35
 # The least squares: damping of each harmonic but the first, times the number of pixels; iterations; and the error, in
 # medians, at which a pixel counts half (Cauchy's weights).
 _DAMPING = 1e-3 * np.array([0, 1, 1, 1, 3, 3, 3, 3, 3.0])
@@ -26,16 +24,6 @@ def evaluate_harmonics(normals: np.ndarray) -> np.ndarray:
     """The real spherical harmonics [..., 9] of degree two and less at unit normals [..., 3], up to factors."""
     x, y, z = np.moveaxis(normals, -1, 0)
     return np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3 * z * z - 1], axis=-1)
-
-
-def find_face(inside: np.ndarray) -> np.ndarray:
-    """The pixels [H, W] bool, of those where a head and its shoulders are seen, that are mostly the middle of the
-    face."""
-    rows, columns = np.nonzero(inside)
-    head = rows < np.quantile(rows, _HEAD)
-    left, right = np.quantile(columns[head], _COLUMNS)
-    y, x = np.indices(inside.shape)
-    return inside & (x > left) & (x < right) & (y > np.quantile(rows[head], _ROWS)) & (y < rows[head].max())
 
 
 def fit_shading(photo: np.ndarray, normals: np.ndarray, colour: np.ndarray) -> np.ndarray:
@@ -55,11 +43,10 @@ def fit_shading(photo: np.ndarray, normals: np.ndarray, colour: np.ndarray) -> n
 
 
 def divide_by_shading(
-    photo: np.ndarray, normals: np.ndarray, inside: np.ndarray, colour: np.ndarray = MEAN_SKIN
+    photo: np.ndarray, normals: np.ndarray, inside: np.ndarray, face: np.ndarray, colour: np.ndarray = MEAN_SKIN
 ) -> np.ndarray:
-    """The albedo [H, W, 3], 0 outside: a linear photo [H, W, 3] over the shading of its unit normals [H, W, 3], if the
-    skin in the middle of the face has the albedo `colour` [3]."""
-    face = find_face(inside)
+    """The albedo [H, W, 3], 0 where not `inside` [H, W]: a linear photo [H, W, 3] over the shading of its unit normals
+    [H, W, 3], if the pixels of the `face` [H, W] are mostly skin of the albedo `colour` [3]."""
     coefficients = fit_shading(photo[face], normals[face], colour)
     least = _DARKEST * np.median(evaluate_harmonics(normals[face]) @ coefficients, axis=0)
     shading = np.maximum(evaluate_harmonics(normals[inside]) @ coefficients, least)
