@@ -15,9 +15,11 @@ from sira_mi.avatar.decoders import (
     specular_albedo,
     specular_albedo_cooperative,
 )
+from sira_mi.avatar.detail import AlbedoDetail
 from sira_mi.avatar.file import load_avatar
 from sira_mi.avatar.shape import HeadShape
 from sira_mi.errors import InputError
+from sira_mi.fields.columns import from_columns, to_columns
 from sira_mi.fields.mlp import layers, pack
 from sira_mi.fields.sdf import deform_cooperative
 from sira_mi.plugins._parameters import check_networks, read_flag
@@ -124,6 +126,7 @@ class NeuralAlbedo(mi.Texture):
         self.latent = mi.Float(tensors["z_a" if self.kind == "diffuse" else "z_s"])
         self.refinement = mi.Float(tensors["albedo_refinement"])
         self.k_r = mi.Float(avatar.k_r)
+        self.detail = AlbedoDetail.of(tensors) if self.kind == "diffuse" else None
         self._sizes = {name: len(value) for name, value in self._parameters().items()}
         self.architecture = avatar.architecture
         self._pack()
@@ -156,8 +159,17 @@ class NeuralAlbedo(mi.Texture):
     def _refinement_network(self):
         return layers(self.architecture.networks["albedo_refinement"], self.refinement)
 
-    def evaluate_columns(self, x_ref, gamma):
-        """The albedo on tensors, outside of symbolic code: x_ref [3, N] and γ [N_γ, N] -> [3, N] or [1, N]."""
+    def evaluate_columns(self, x, x_ref, gamma):
+        """The albedo on tensors, outside of symbolic code: points x [3, N] in the field's coordinates, x_ref [3, N] and
+        γ [N_γ, N] -> [3, N] or [1, N]."""
+        albedo = self.evaluate_networks(x_ref, gamma)
+        if self.detail is None:
+            return albedo
+        factor = mi.Color3f(*self.detail.factor(from_columns(x, mi.Point3f)))
+        return dr.minimum(albedo * to_columns(factor), 1.0)
+
+    def evaluate_networks(self, x_ref, gamma):
+        """The albedo without its detail, as `evaluate_columns` takes and returns it."""
         a = self.architecture
         if self.kind == "specular":
             return specular_albedo(self._network(), a.specular_octaves, x_ref)
@@ -179,19 +191,29 @@ class NeuralAlbedo(mi.Texture):
     def _evaluate(self, si) -> list:
         """The albedo at a surface interaction: three Floats (diffuse) or one (specular)."""
         self._check_gradients()
-        return self._look_up(si) if self.baked else self._network_albedo(*self._place(si))
+        albedo = self._look_up(si) if self.baked else self._network_albedo(*self._place(si))
+        return self._add_detail(albedo, si)
+
+    def _add_detail(self, albedo: list, si) -> list:
+        if self.detail is None:
+            return albedo
+        return [dr.minimum(a * f, 1.0) for a, f in zip(albedo, self.detail.factor(self._point(si)), strict=True)]
 
     def _check_gradients(self) -> None:
         if any(now and not then for now, then in zip(self._gradients(), self._attached, strict=True)):
             raise RuntimeError("neural_albedo: gradients enabled since the last update; call params.update() first")
 
-    def _place(self, si) -> tuple[list, list]:
-        """x_ref and γ of a surface interaction."""
+    def _point(self, si):
+        """The point of a surface interaction in the field's coordinates."""
         point = self._to_local @ si.p
         if self._mesh is not None:
             instanced = is_instanced(si)
             point = dr.select(instanced, self._on_mesh(self._mesh, si, instanced), point)
-        return deform_cooperative(self._deformation, self.architecture.sdf_octaves, list(point))
+        return point
+
+    def _place(self, si) -> tuple[list, list]:
+        """x_ref and γ of a surface interaction."""
+        return deform_cooperative(self._deformation, self.architecture.sdf_octaves, list(self._point(si)))
 
     @staticmethod
     def _on_mesh(mesh: FieldMesh, si, active):
@@ -241,6 +263,7 @@ class NeuralAlbedo(mi.Texture):
         specular._check_gradients()
         place = self._place(si)
         diffuse, other = (texture._network_albedo(*place) for texture in (self, specular))
+        diffuse = self._add_detail(diffuse, si)
         value = self._one(diffuse) if mi.is_monochromatic else self._three(diffuse)
         return mi.Spectrum(value) & active, specular._one(other) & active
 

@@ -237,7 +237,7 @@ class NeuralSDF(mi.Mesh):
             return {}
         field, textures = self.field(), self._baked.values()
         columns = evaluate_in_chunks(
-            lambda x: tuple(texture.evaluate_columns(*deform(field, x)) for texture in textures), self.vertices()
+            lambda x: tuple(texture.evaluate_networks(*deform(field, x)) for texture in textures), self.vertices()
         )
         for texture in textures:
             texture.changed = False

@@ -407,7 +407,7 @@ class HeadShader:
     def _albedo(self, texture, x, x_ref, gamma, rows: int):
         """The albedo [rows, N] of a texture at points x, which lie at x_ref in reference space."""
         if isinstance(texture, NeuralAlbedo):
-            return texture.evaluate_columns(x_ref, gamma)[0:rows, :]
+            return texture.evaluate_columns(x, x_ref, gamma)[0:rows, :]
         si = dr.zeros(mi.SurfaceInteraction3f, x.shape[1])
         si.p = self.head.to_world @ from_columns(x, mi.Point3f)
         value = texture.eval(si) if rows == 3 else texture.eval_1(si)
@@ -419,7 +419,7 @@ def mesh_albedos(head, bsdf, si, x) -> list:
     coordinates: of the networks, or looked up at `si` where a texture is baked or of another kind."""
     textures = (bsdf.diffuse_albedo, bsdf.specular_albedo)
     by_network = [isinstance(texture, NeuralAlbedo) and not texture.baked for texture in textures]
-    inputs = evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy()) if any(by_network) else []
+    inputs = [x.numpy(), *evaluate_in_chunks(lambda p: deform(head.field(), p), x.numpy())] if any(by_network) else []
     result = []
     with dr.suspend_grad():
         for texture, neural, rows in zip(textures, by_network, (3, 1), strict=True):

@@ -248,8 +248,8 @@ def test_channels_of_the_closed_form(shaded, shaded_image):
     assert np.abs(f).max() < 2e-3  # the ray starts at the near plane
     np.testing.assert_allclose(part["normal"][mask].T, gradient / np.linalg.norm(gradient, axis=0), atol=2e-3)
     bsdf = head.bsdf()
-    albedo = bsdf.diffuse_albedo.evaluate_columns(mi.TensorXf(x_ref), mi.TensorXf(gamma)).numpy()
-    specular = bsdf.specular_albedo.evaluate_columns(mi.TensorXf(x_ref), mi.TensorXf(gamma)).numpy()
+    albedo = bsdf.diffuse_albedo.evaluate_networks(mi.TensorXf(x_ref), mi.TensorXf(gamma)).numpy()
+    specular = bsdf.specular_albedo.evaluate_networks(mi.TensorXf(x_ref), mi.TensorXf(gamma)).numpy()
     np.testing.assert_allclose(part["diffuse_albedo"][mask].T, albedo, atol=2e-3)
     np.testing.assert_allclose(part["specular_albedo"][mask], specular[0], atol=2e-3)
     np.testing.assert_allclose(

@@ -34,7 +34,7 @@ def in_reference_space(avatar, p):
 def test_both_modes_agree(avatar, avatar_path, kind):
     albedo, si = texture(avatar_path, kind=kind), interaction()
     x_ref, gamma = in_reference_space(avatar, si.p)
-    columns = albedo.evaluate_columns(x_ref, gamma).numpy()
+    columns = albedo.evaluate_networks(x_ref, gamma).numpy()
     values = np.array(albedo.eval(si))
     assert columns.shape[0] == (3 if kind == "diffuse" else 1)
     np.testing.assert_allclose(values, np.broadcast_to(columns, values.shape), atol=1e-5)

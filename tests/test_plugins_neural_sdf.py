@@ -267,8 +267,8 @@ def test_a_nested_albedo_follows_the_shape(avatar, avatar_path):
     params.update()
     x = head.vertices()
     _, _, x_ref, gamma = surface(head.field(), mi.TensorXf(x))
-    np.testing.assert_allclose(albedo(x), texture.evaluate_columns(x_ref, gamma).numpy(), atol=1e-5)
-    stale = texture.evaluate_columns(mi.TensorXf(x), gamma).numpy()
+    np.testing.assert_allclose(albedo(x), texture.evaluate_networks(x_ref, gamma).numpy(), atol=1e-5)
+    stale = texture.evaluate_networks(mi.TensorXf(x), gamma).numpy()
     assert np.abs(albedo(x) - stale).max() > 1e-3
     assert before.shape[0] == 3
     image = mi.render(scene, spp=4).numpy()

@@ -66,7 +66,7 @@ def albedos(scene):
 
     def networks(x):
         x_ref, gamma = deform(field, x)
-        return tuple(t.evaluate_columns(x_ref, gamma) for t in (bsdf.diffuse_albedo, bsdf.specular_albedo))
+        return tuple(t.evaluate_networks(x_ref, gamma) for t in (bsdf.diffuse_albedo, bsdf.specular_albedo))
 
     mask = hit.numpy().astype(bool)
     local = shape.to_local @ si.p

@@ -30,6 +30,9 @@ _MAXIMUM_DIRECTIONS = 256
 OPTIONAL = {"light_refinement"}
 # Of a prior that knows how landmarks follow from places in reference space (`sira_mi.avatar.landmark_model`).
 LANDMARK_MODEL = {"landmark_placed", "landmark_directions", "landmark_offsets"}
+# Of an avatar whose albedo has the detail of a photo (`sira_mi.avatar.detail`).
+DETAIL = {"detail", "detail_depth", "detail_camera"}
+_MAXIMUM_DETAIL = 4096  # pixels a side
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Avatar:
     """One head. `tensors` holds, as float32 arrays: every network [parameters] and latent [dimension] of the
     architecture (`light_refinement` may be missing); `lobes` [N_l, 7] (axis, sharpness, RGB amplitude) of the light;
     `landmarks` [468, 3], the face landmarks of the mean head in scene units (NaN where unknown). A prior may also hold
-    the tensors of `sira_mi.avatar.landmark_model`."""
+    the tensors of `sira_mi.avatar.landmark_model`, an avatar those of `sira_mi.avatar.detail`."""
 
     architecture: AvatarArchitecture
     tensors: dict[str, np.ndarray]
@@ -152,6 +155,11 @@ def _check(avatar: Avatar) -> None:
             raise ValueError(f"between 1 and {_MAXIMUM_DIRECTIONS} directions of landmarks expected")
         due |= {"landmark_placed": (LANDMARKS, 3)}
         due |= dict.fromkeys(("landmark_directions", "landmark_offsets"), (count, LANDMARKS, 3))
+    if DETAIL & set(tensors):
+        size = tensors["detail"].shape[:2]
+        if len(size) != 2 or not all(0 < side <= _MAXIMUM_DETAIL for side in size):
+            raise ValueError(f"the detail has 1 to {_MAXIMUM_DETAIL} pixels a side")
+        due |= {"detail": (*size, 3), "detail_depth": size, "detail_camera": (3, 4)}
     for name, shape in due.items():
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.float32:

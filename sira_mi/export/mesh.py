@@ -22,7 +22,7 @@ def write_mesh(path: Path, shape) -> None:
 
     def columns(x):
         _, gradient, x_ref, gamma = surface(field, x)
-        return gradient, texture.evaluate_columns(x_ref, gamma)
+        return gradient, texture.evaluate_columns(x, x_ref, gamma)
 
     gradient, albedo = evaluate_in_chunks(columns, vertices)
     mesh = trimesh.Trimesh(

@@ -66,7 +66,7 @@ def evaluate_albedos(shape: NeuralSDF, x: np.ndarray) -> tuple[np.ndarray, np.nd
 
     def columns(points):
         inputs = deform(field, points)
-        return tuple(texture.evaluate_columns(*inputs) for texture in textures)
+        return tuple(texture.evaluate_columns(points, *inputs) for texture in textures)
 
     diffuse, specular = evaluate_in_chunks(columns, x)
     return diffuse, specular

@@ -78,7 +78,7 @@ def field_points(case: Case, scene: mi.Scene, head: NeuralSDF, side: int, seed: 
 
     def columns(x, direction):
         _, gradient, x_ref, gamma = surface(field, x)
-        albedos = (texture.evaluate_columns(x_ref, gamma) for texture in textures)
+        albedos = (texture.evaluate_columns(x, x_ref, gamma) for texture in textures)
         return (normalise(gradient), -normalise(direction), *albedos)
 
     normal, view, diffuse, specular = evaluate_in_chunks(columns, x, direction.numpy())
