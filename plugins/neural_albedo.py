@@ -165,8 +165,8 @@ class NeuralAlbedo(mi.Texture):
         albedo = self.evaluate_networks(x_ref, gamma)
         if self.detail is None:
             return albedo
-        factor = mi.Color3f(*self.detail.factor(from_columns(x, mi.Point3f)))
-        return dr.minimum(albedo * to_columns(factor), 1.0)
+        blended = self.detail.blend(list(from_columns(albedo, mi.Color3f)), from_columns(x, mi.Point3f))
+        return to_columns(mi.Color3f(*blended))
 
     def evaluate_networks(self, x_ref, gamma):
         """The albedo without its detail, as `evaluate_columns` takes and returns it."""
@@ -195,9 +195,7 @@ class NeuralAlbedo(mi.Texture):
         return self._add_detail(albedo, si)
 
     def _add_detail(self, albedo: list, si) -> list:
-        if self.detail is None:
-            return albedo
-        return [dr.minimum(a * f, 1.0) for a, f in zip(albedo, self.detail.factor(self._point(si)), strict=True)]
+        return albedo if self.detail is None else self.detail.blend(albedo, self._point(si))
 
     def _check_gradients(self) -> None:
         if any(now and not then for now, then in zip(self._gradients(), self._attached, strict=True)):

@@ -156,10 +156,10 @@ def _check(avatar: Avatar) -> None:
         due |= {"landmark_placed": (LANDMARKS, 3)}
         due |= dict.fromkeys(("landmark_directions", "landmark_offsets"), (count, LANDMARKS, 3))
     if DETAIL & set(tensors):
-        size = tensors["detail"].shape[:2]
-        if len(size) != 2 or not all(0 < side <= _MAXIMUM_DETAIL for side in size):
+        sizes = {name: tensors[name].shape[:2] for name in ("detail", "detail_depth")}
+        if not all(len(size) == 2 and 0 < min(size) <= max(size) <= _MAXIMUM_DETAIL for size in sizes.values()):
             raise ValueError(f"the detail has 1 to {_MAXIMUM_DETAIL} pixels a side")
-        due |= {"detail": (*size, 3), "detail_depth": size, "detail_camera": (3, 4)}
+        due |= {"detail": (*sizes["detail"], 4), "detail_depth": sizes["detail_depth"], "detail_camera": (3, 4)}
     for name, shape in due.items():
         tensor = tensors[name]
         if tensor.shape != shape or tensor.dtype != np.float32:

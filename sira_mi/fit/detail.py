@@ -1,92 +1,90 @@
-"""The detail of the albedo: what eq. 8 and the refinements leave of the photo, pixel by pixel, in closed form.
+"""The detail of the albedo, in closed form from the photo at its full resolution.
 
-Eq. 8 is linear in the diffuse albedo, so the factor that makes a pixel right is the photo's radiance less the specular
-term over the diffuse one. The networks of the refinements are smooth; eyes, brows, lips, hair and cloth are not.
+Eq. 8 is linear in the diffuse albedo: the albedo of a pixel is the photo's radiance less the specular term, over the
+irradiance. Irradiance and specular term come from the fit, with its refinement of the light. They are smooth, so that
+they are evaluated at the working size. Eyes, brows, lips, hair and cloth are not smooth, and no network holds them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import cv2
 import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from sira_mi.avatar.decoders import albedo_refinement, light_refinement, refine_albedo
+from sira_mi.avatar.decoders import light_refinement
 from sira_mi.avatar.file import Avatar
 from sira_mi.fields.columns import CHUNK
 from sira_mi.fit.appearance import PhotoSurface, share_surface
-from sira_mi.fit.shaded import PhotoPoints, base_albedo, decoder, shade_points
+from sira_mi.fit.shaded import PhotoPoints, decoder, shade_points
 from sira_mi.fit.stage import FitTask
 from sira_mi.fit.state import FitState
-from sira_mi.portrait.camera import Camera
 
-# Added to radiances before their logarithm: darker pixels are noise.
-_DARK = 0.004
-# Range of the logarithm of the factor, and the highest albedo.
-_LARGEST, _HIGHEST_ALBEDO = 2.5, 0.95
+# The highest albedo, and the least irradiance over π as a share of its mean over the photo's points.
+_HIGHEST_ALBEDO, _LEAST_IRRADIANCE = 0.95, 0.03
 # Cosines to the view between which a surface is too oblique for its pixel to say anything of it.
 _OBLIQUE = (0.1, 0.3)
-# Pixels by which the detail goes on beyond the mask, for lookups between pixels.
-_MARGIN = 3
+# Pixels of the working image: from the outline of the head to where the detail begins and to where it is whole, as
+# pixels on the outline show the background too; and by which the layers go on beyond it, for lookups between pixels.
+_OUTLINE, _MARGIN = (1.0, 3.0), 2
 
 
-def find_detail(task: FitTask, state: FitState, k_s: float, k_r: float) -> dict[str, np.ndarray]:
-    """The tensors of `sira_mi.avatar.detail` for the avatar at `state`, with the weights k_s and k_r of eqs 8 and 11."""
+def find_detail(task: FitTask, state: FitState, k_s: float) -> dict[str, np.ndarray]:
+    """The tensors of `sira_mi.avatar.detail` for the avatar at `state`, with the weight k_s of eq. 8."""
     surface = share_surface(task, state)
-    points, camera = surface.points, surface.portrait.camera
-    depth = (camera.world_to_camera[:3] @ _homogeneous(points.origin + points.t * points.view))[2]
-    logarithm = _log_factor(task.prior, state, surface, k_s, k_r)
-    oblique = np.clip((-(points.normal * points.view).sum(axis=0) - _OBLIQUE[0]) / np.ptp(_OBLIQUE), 0, 1)
-    return draw_detail(camera, points.row, points.column, logarithm * oblique, depth)
+    points, portrait = surface.points, surface.portrait
+    camera, size = portrait.camera, portrait.mask.shape
+    place = np.concatenate([points.origin + points.t * points.view, np.ones_like(points.t)])
+    cosine = -(points.normal * points.view).sum(axis=0, keepdims=True)
+    within = distance_transform_edt(_spread(np.ones_like(points.t), points, size, margin=0)[..., 0])
+    weight = _rise(cosine, _OBLIQUE) * _rise(within[points.row, points.column], _OUTLINE)
+    irradiance, specular = _shade_photo(task.prior, state, surface, k_s)
+    layers = _spread(np.concatenate([irradiance, specular, weight]), points, size)
+    depth = _spread((camera.world_to_camera[:3] @ place)[2:], points, size)[..., 0]
+
+    photo = portrait.image if portrait.sharp is None else portrait.sharp
+    height, width = photo.shape[:2]
+    layers = cv2.resize(layers, (width, height), interpolation=cv2.INTER_LINEAR)
+    albedo = np.clip((photo - layers[..., 3:6]) / np.maximum(layers[..., :3], 1e-6), 0, _HIGHEST_ALBEDO)
+    to_unit = np.diag([1 / camera.width, 1 / camera.height, 1.0])
+    return {
+        "detail": np.concatenate([albedo, layers[..., 6:]], axis=-1).astype(np.float32),
+        "detail_depth": depth,
+        "detail_camera": (to_unit @ camera.K @ camera.world_to_camera[:3]).astype(np.float32),
+    }
 
 
-def _homogeneous(points: np.ndarray) -> np.ndarray:
-    return np.concatenate([points, np.ones((1, points.shape[1]))])
-
-
-def _log_factor(avatar: Avatar, state: FitState, surface: PhotoSurface, k_s: float, k_r: float) -> np.ndarray:
-    """The logarithm [3, N] of the photo's radiance over that of eq. 8, its refinements included, as a factor of the
-    diffuse albedo."""
+def _shade_photo(avatar: Avatar, state: FitState, surface: PhotoSurface, k_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance over π and specular radiance [3, N] at the photo's points, in the photo's light."""
     parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
     count = surface.radiance.shape[1]
     pieces = np.array_split(np.arange(count), max(1, -(-count // CHUNK)))
-    found = [_shade(avatar, parameters, surface.points[index], k_s, k_r) for index in pieces]
-    albedo, diffuse, specular = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
-    wanted = np.maximum(surface.radiance - specular, 0)
-    highest = np.log(_HIGHEST_ALBEDO / np.maximum(albedo, 1e-3))
-    logarithm = np.log((wanted + _DARK) / (diffuse + _DARK))
-    return np.clip(logarithm, -_LARGEST, np.minimum(_LARGEST, highest))
+    found = [_shade(avatar, parameters, surface.points[index], k_s) for index in pieces]
+    irradiance, specular = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
+    return np.maximum(irradiance, _LEAST_IRRADIANCE * irradiance.mean()), specular
 
 
-def _shade(avatar: Avatar, parameters: dict, points: PhotoPoints, k_s: float, k_r: float) -> tuple[np.ndarray, ...]:
-    """Diffuse albedo, diffuse and specular radiance [3, n] in the light of the photo, its refinement included."""
+def _shade(avatar: Avatar, parameters: dict, points: PhotoPoints, k_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance over π and specular radiance [3, n] at some points."""
+    white = mi.TensorXf(np.ones((3, len(points.row)), np.float32))
+    shading = shade_points(avatar, parameters, k_s, points, white)
     octaves = avatar.architecture.refinement_octaves
-    x_ref, gamma = mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)
-    fine = albedo_refinement(decoder(avatar, "albedo_refinement", parameters), octaves, x_ref, gamma)
-    albedo = refine_albedo(base_albedo(avatar, parameters, points), fine, k_r)
-    shading = shade_points(avatar, parameters, k_s, points, albedo)
-    factor = np.float32(1)
-    if "light_refinement" in parameters:
-        light = light_refinement(decoder(avatar, "light_refinement", parameters), octaves, x_ref, gamma)
-        factor = np.exp(light.numpy())
-    return albedo.numpy(), factor * shading.diffuse.numpy(), factor * shading.specular.numpy()
+    network = decoder(avatar, "light_refinement", parameters)
+    factor = np.exp(light_refinement(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)).numpy())
+    return factor * shading.diffuse.numpy(), factor * shading.specular.numpy()
 
 
-def draw_detail(
-    camera: Camera, row: np.ndarray, column: np.ndarray, logarithm: np.ndarray, depth: np.ndarray
-) -> dict[str, np.ndarray]:
-    """The tensors of `sira_mi.avatar.detail` of a `camera` in the field's coordinates, whose pixels at `row` and
-    `column` [N] have the `logarithm` [3, N] of the factor and the `depth` [N]."""
-    size = camera.height, camera.width
-    values = np.zeros((*size, 3), np.float32)
-    depths = np.zeros(size, np.float32)
-    values[row, column], depths[row, column] = logarithm.T, depth
-    away, nearest = distance_transform_edt(depths == 0, return_indices=True)
-    near = away <= _MARGIN
-    values[near], depths[near] = (a[nearest[0][near], nearest[1][near]] for a in (values, depths))
-    return {
-        "detail": values,
-        "detail_depth": depths,
-        "detail_camera": (camera.K @ camera.world_to_camera[:3]).astype(np.float32),
-    }
+def _rise(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """From 0 at the first of the limits, linearly, to 1 at the second."""
+    return np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
+
+
+def _spread(values: np.ndarray, points: PhotoPoints, size: tuple[int, int], margin: int = _MARGIN) -> np.ndarray:
+    """Values [C, N] at the photo's points as a picture [H, W, C], 0 where no point is within `margin` pixels."""
+    picture = np.zeros((*size, len(values)), np.float32)
+    known = np.zeros(size, bool)
+    picture[points.row, points.column], known[points.row, points.column] = values.T, True
+    away, (row, column) = distance_transform_edt(~known, return_indices=True)
+    near = away <= margin
+    picture[near] = picture[row[near], column[near]]
+    return picture

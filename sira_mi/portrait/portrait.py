@@ -27,6 +27,7 @@ _CAMERA_MISMATCH = 0.25  # in face sizes; a given camera that is further off ear
 @dataclass(frozen=True)
 class PortraitSettings:
     working_size: int = 512  # longest side of the working image, pixels; photos are never enlarged
+    sharp_size: int = 1024  # the same of `Portrait.sharp`, which is at least as large as the working image
     max_pixels: int = DEFAULT_MAX_PIXELS  # larger photos are reduced while loading, pixels
 
 
@@ -40,6 +41,7 @@ class Portrait:
     notes: tuple[str, ...]  # messages for the user, one line each
     exposure: float = 1.0  # other than 1 only for photos that store radiance, whose unit is arbitrary
     window: tuple[float, ...] | None = None  # x0, y0, x1, y1: where `image` lies in the photo, the photo's pixels
+    sharp: np.ndarray | None = None  # [sH, sW, 3] float32, `image` with more pixels, where the photo has them
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,13 @@ class _Window:
 
     def to_working(self, points: np.ndarray) -> np.ndarray:
         return (points - [self.x0, self.y0]) * [self.scale_x, self.scale_y]
+
+    def enlarge(self, longest: int) -> "_Window":
+        """The same part of the photo with a longest side of at most `longest` pixels, not enlarged."""
+        factor = min(longest / max(self.width, self.height), 1 / max(self.scale_x, self.scale_y))
+        width, height = (max(1, round(side * max(factor, 1.0))) for side in (self.width, self.height))
+        scale_x, scale_y = self.scale_x * width / self.width, self.scale_y * height / self.height
+        return _Window(self.x0, self.y0, scale_x, scale_y, width, height)
 
     def resample(self, image: np.ndarray) -> np.ndarray:
         return area_resample(image, (self.x0, self.y0), (self.scale_x, self.scale_y), (self.width, self.height))
@@ -110,6 +119,7 @@ def make_portrait(
             notes.append("the mask covers the whole photo: all of it counts as the person")
     window = _choose_window(photo, found, camera, settings.working_size, notes)
     image = np.maximum(window.resample(photo.image), 0)
+    sharp = np.maximum(window.enlarge(settings.sharp_size).resample(photo.image), 0)
     height, width = image.shape[:2]
     camera = camera.crop(window.x0, window.y0, 0, 0).scale(window.scale_x, window.scale_y, width, height)
 
@@ -123,9 +133,9 @@ def make_portrait(
         error = measure_reprojection_error(camera, of_head, np.asarray(mean_landmarks, np.float64))
         if error > _CAMERA_MISMATCH * working_face.size:
             notes.append(f"the given camera shows the head {error:.0f} pixels away from the face in the photo")
-    image, mask = image.astype(np.float32), mask.astype(np.float32)
+    image, sharp, mask = (a.astype(np.float32) for a in (image, sharp, mask))
     edges = tuple(edge * photo.reduction for edge in window.edges)
-    return Portrait(image, mask, landmarks, of_head, camera, tuple(notes), exposure, edges)
+    return Portrait(image, mask, landmarks, of_head, camera, tuple(notes), exposure, edges, sharp)
 
 
 def make_display_image(image: np.ndarray) -> np.ndarray:
