@@ -69,7 +69,7 @@ def variant():
 
 def tiny_fit(steps: int) -> FitSettings:
     """A fit of `steps` steps a stage: every stage and every file is real, only too short to look good."""
-    stages = tuple(dataclasses.replace(stage, steps=steps) for stage in QUALITIES["standard"].stages)
+    stages = tuple(dataclasses.replace(s, steps=steps if s.steps else 0) for s in QUALITIES["standard"].stages)
     sizes = {"working_size": 128, "rays": 256, "points": 64, "pixels": 256, "voxel": 0.16, "final_voxel": 0.12}
     return FitSettings("tiny", **sizes, stages=stages, block=3)
 

@@ -8,7 +8,8 @@ import pytest
 from conftest import camera
 
 from sira_mi.avatar.detail import AlbedoDetail
-from sira_mi.avatar.file import load_avatar, save_avatar
+from sira_mi.avatar.file import DETAIL, load_avatar, save_avatar
+from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.state import FitState
@@ -77,13 +78,10 @@ def test_a_detail_is_whole_or_refused(avatar, tmp_path, name):
 
 @pytest.mark.slow
 def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
-    """Of a head with stripes four photo pixels wide, which one pixel of the working image averages in pairs; rendered by
-    eq. 8 of the same head."""
-    from sira_mi.fit.detail import find_detail
+    """Of a head with stripes half as wide as a pixel of the working image; rendered by eq. 8 of the same head."""
     from sira_mi.fit.shaded import find_surface_points, shade_points
     from sira_mi.fit.stage import FitTask
 
-    avatar = avatar.with_tensors(light_refinement=np.zeros(avatar.architecture.networks["light_refinement"].parameters))
     avatar = avatar.with_tensors(landmarks=np.zeros((468, 3)))
     path = tmp_path / "prior.safetensors"
     save_avatar(path, avatar)
@@ -96,7 +94,7 @@ def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
     )
     task = FitTask(blank, avatar, path, settings, tmp_path, settings.plan())
     points = task.photo_points(blank, head)
-    true = STRIPE[points.column // 4 % 2]
+    true = STRIPE[points.column // 2 % 2]
     state = FitState.of_avatar(avatar)
     floats = {name: mi.Float(v) for name, v in state.avatar.items()}
     albedo = mi.TensorXf(np.repeat(true[None], 3, axis=0).astype(np.float32))
@@ -111,7 +109,8 @@ def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
         coarse.astype(np.float32), covered[..., 0].astype(np.float32), nowhere, nowhere, view, (), sharp=photo
     )
     task = FitTask(portrait, avatar, path, settings, tmp_path, settings.plan())
-    found = find_detail(task, state, k_s=1.0)
+    fitted = settings.stages[-1].problem(task, state).start(state).avatar
+    found = {name: fitted[name] for name in DETAIL}
     assert found["detail"].shape == (*photo.shape[:2], 4)
     detail = found["detail"][points.row, points.column]
     whole = detail[:, 3] == 1
@@ -119,7 +118,7 @@ def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
     assert np.median(np.abs(detail[whole, :3] - true[whole, None])) < 0.01
     assert np.quantile(np.abs(detail[whole, :3] - true[whole, None]), 0.9) < 0.04
 
-    save_avatar(tmp_path / "fitted", avatar.with_tensors(**found))
+    save_avatar(tmp_path / "fitted", avatar.with_tensors(**fitted))
     shown = mi.load_dict(
         {
             "type": "neural_sdf",
@@ -138,3 +137,18 @@ def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
     expected = found["detail"][seen.row, seen.column]
     sure = expected[:, 3] == 1
     assert np.quantile(np.abs(columns.T[sure] - expected[sure, :3]), 0.9) < 0.02
+
+
+def test_the_light_is_scaled_to_the_luminance_of_the_skin(variant):
+    """Skin under a light 1.7 times as bright as the fit's, specular term included; where none is seen, and where no
+    light within three stops does it, the light stays as it is."""
+    from sira_mi.fit.detail import find_light_factor
+
+    rng = np.random.default_rng(0)
+    irradiance, specular = rng.uniform(0.2, 0.8, (3, 51)), rng.uniform(0.0, 0.05, (3, 51))
+    albedo = np.array([[0.3], [0.2], [0.1]])
+    luminance = float(LUMINANCE @ albedo[:, 0])
+    radiance = 1.7 * (albedo * irradiance + specular)
+    assert find_light_factor(radiance, irradiance, specular, luminance) == pytest.approx(1.7, rel=2e-3)
+    assert find_light_factor(radiance[:, :0], irradiance[:, :0], specular[:, :0], luminance) == 1
+    assert find_light_factor(100 * radiance, irradiance, specular, luminance) == 1

@@ -345,7 +345,7 @@ def test_a_fit_with_and_without_the_plan_is_the_same(task):
 @pytest.mark.slow
 def test_a_changed_base_albedo_is_computed_again(task):
     """The base albedo of a stage that holds it is that of the state at hand, also after another stage moved it."""
-    stage, index = task.settings.stages[-1], np.arange(10)
+    stage, index = task.settings.stages[-2], np.arange(10)
     state = initial_state(task.prior, 0)
     once, always = (stage.problem(task.with_plan(plan), state) for plan in (task.plan, task.plan.keep_all()))
     values = []

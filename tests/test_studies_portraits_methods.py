@@ -7,7 +7,8 @@ from conftest import camera
 
 from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.fit.appearance import AppearanceStage
-from sira_mi.fit.refinement import RefinementStage
+from sira_mi.fit.detail import DetailStage
+from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.shading import ShadingStage
 from sira_mi.fit.stage import FitTask
@@ -33,9 +34,11 @@ def test_ablations_are_those_of_the_paper():
     assert moved("b.4") - moved("b.3") == {"z_sdf", "deformation"}
     for quality in QUALITIES.values():
         assert [type(stage) for stage in BY_NAME["b.4"].settings(quality).stages].count(ShadingStage) == 1
-        assert RefinementStage not in [type(stage) for stage in BY_NAME["b.7"].settings(quality).stages]
+        for name, refined in {"b.7": AlbedoRefinementStage, "b.8": RefinementStage}.items():
+            assert type(BY_NAME[name].settings(quality).stages[-1]) is refined
+        assert type(BY_NAME["b.3"].settings(quality).stages[-1]) is DetailStage
     assert moved("b.5") == {"z_l", "illumination", "z_s", "albedo_refinement"}
-    assert moved("b.3") - moved("b.7") == {"light_refinement"} and moved("b.6") == moved("b.3")
+    assert moved("b.8") - moved("b.7") == {"light_refinement"} and moved("b.6") == moved("b.3") == moved("b.7")
     others = {method.name for method in METHODS if method.task is FitTask}
     assert {"a.4", "b.3"} < others and not {"a.3", "b.6"} & others
 
@@ -51,7 +54,7 @@ def test_a_method_and_what_it_goes_on_from_take_the_steps_of_the_fit():
             assert steps == geometry + appearance
         elif method.after is None:
             assert steps == geometry
-        elif method.name in ("b.1", "b.3", "b.4", "b.6", "b.7"):
+        elif method.name in ("b.1", "b.3", "b.4", "b.6", "b.7", "b.8"):
             assert steps == appearance
     for quality in QUALITIES.values():
         stages = BY_NAME["a.4"].settings(quality).stages + BY_NAME["b.3"].settings(quality).stages

@@ -1,11 +1,15 @@
-"""The detail of the albedo, in closed form from the photo at its full resolution.
+"""The detail stage: the diffuse albedo of all that the photo shows, in closed form, at the photo's full resolution.
 
 Eq. 8 is linear in the diffuse albedo: the albedo of a pixel is the photo's radiance less the specular term, over the
-irradiance. Irradiance and specular term come from the fit, with its refinement of the light. They are smooth, so that
-they are evaluated at the working size. Eyes, brows, lips, hair and cloth are not smooth, and no network holds them.
-"""
+irradiance. Both come from the fit and are smooth, so that they are evaluated at the working size. Eyes, brows, lips,
+hair and cloth are not smooth, and no network holds them. The paper has no such stage.
+
+The level of light and albedo together is ambiguous: first the light is scaled so that bare skin has the luminance that
+the photo's cues say (`sira_mi.fit.skin`)."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import mitsuba as mi
@@ -14,14 +18,14 @@ from scipy.ndimage import distance_transform_edt
 from scipy.optimize import brentq
 from scipy.special import logit
 
-from sira_mi.avatar.decoders import albedo_refinement, light_refinement, refine_albedo
+from sira_mi.avatar.decoders import albedo_refinement, refine_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.columns import CHUNK
-from sira_mi.fit.appearance import PhotoSurface, share_surface
-from sira_mi.fit.shaded import PhotoPoints, base_albedo, decoder, shade_points
+from sira_mi.fit.appearance import PhotoSurface, scale_light, share_surface
+from sira_mi.fit.shaded import Arrays, PhotoPoints, base_albedo, decoder, shade_points
 from sira_mi.fit.skin import find_near_landmarks
-from sira_mi.fit.stage import FitTask
+from sira_mi.fit.stage import FitTask, Problem, Stage
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.landmarks import BARE_SKIN
 
@@ -29,100 +33,134 @@ from sira_mi.portrait.landmarks import BARE_SKIN
 _HIGHEST_ALBEDO, _LEAST_IRRADIANCE = 0.95, 0.03
 # Cosines to the view between which a surface is too oblique for its pixel to say anything of it.
 _OBLIQUE = (0.1, 0.3)
-# Stops, either way, by which the light's level may be wrong.
-_MOST_STOPS = 3.0
+# Stops, either way, by which the light's level may be wrong, and how often the light is scaled: a scaled light is only
+# about as bright as asked for.
+_MOST_STOPS, _SCALINGS = 3.0, 3
 # Pixels of the working image: from the outline of the head to where the detail begins and to where it is whole, as
 # pixels on the outline show the background too; and by which the layers go on beyond it, for lookups between pixels.
 _OUTLINE, _MARGIN = (1.0, 3.0), 2
 
 
-def find_detail(task: FitTask, state: FitState, k_s: float, k_r: float) -> tuple[dict[str, np.ndarray], float]:
-    """For the avatar at `state`, with the weights k_s and k_r of eqs 8 and 11: the tensors of `sira_mi.avatar.detail`,
-    and the network `diffuse_albedo` at the same level; and the factor of the light with which they are found."""
-    surface = share_surface(task, state)
-    points, portrait = surface.points, surface.portrait
-    camera, size = portrait.camera, portrait.mask.shape
-    place = np.concatenate([points.origin + points.t * points.view, np.ones_like(points.t)])
-    cosine = -(points.normal * points.view).sum(axis=0, keepdims=True)
+@dataclass(frozen=True)
+class DetailStage(Stage):
+    """The last stage; it takes no steps."""
+
+    k_s: tuple[float, float] = (1.0, 1.0)
+    k_r: float = 1.0
+
+    def problem(self, task: FitTask, state: FitState) -> Problem:
+        return DetailProblem(self, task, share_surface(task, state))
+
+
+class DetailProblem:
+    """What the detail stage sets."""
+
+    def __init__(self, stage: DetailStage, task: FitTask, surface: PhotoSurface):
+        self.stage, self.avatar, self.surface = stage, task.prior, surface
+
+    def start(self, state: FitState) -> FitState:
+        """Scales the light, adds the tensors of `sira_mi.avatar.detail`, and shifts the network of the diffuse albedo
+        to their level."""
+        state = self._scale_light(state)
+        points = self.surface.points
+        irradiance, specular = self._shade(state, points)
+        irradiance = np.maximum(irradiance, _LEAST_IRRADIANCE * irradiance.mean())
+        seen = np.clip((self.surface.radiance - specular) / irradiance, 0, _HIGHEST_ALBEDO)
+        network = self._shift_network(state, points, seen)
+        return state.with_parameters({"diffuse_albedo": network, **draw_detail(self.surface, irradiance, specular)})
+
+    def refresh(self, state: FitState) -> None:
+        pass
+
+    def losses(self, parameters: Arrays, step: int, rng: np.random.Generator) -> Arrays:
+        raise ValueError("the detail stage takes no steps")
+
+    def _scale_light(self, state: FitState) -> FitState:
+        surface = self.surface
+        if surface.skin is None:
+            return state
+        near = np.zeros(surface.portrait.mask.shape, bool)
+        near[find_near_landmarks(surface.portrait.landmarks, BARE_SKIN, surface.portrait.mask > 0.5)] = True
+        chosen = np.flatnonzero(near[surface.points.row, surface.points.column])
+        points, radiance = surface.points[chosen], surface.radiance[:, chosen]
+        for _ in range(_SCALINGS):
+            factor = find_light_factor(radiance, *self._shade(state, points), surface.skin.luminance)
+            light = scale_light(self.avatar, state.avatar["illumination"], factor)
+            state = state.with_parameters({"illumination": light})
+        return state
+
+    def _shade(self, state: FitState, points: PhotoPoints) -> tuple[np.ndarray, np.ndarray]:
+        """Irradiance over π and specular radiance [3, n] at points of the photo."""
+        parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
+        pieces = np.array_split(np.arange(len(points.row)), max(1, -(-len(points.row) // CHUNK)))
+        found = []
+        for index in pieces:
+            white = mi.TensorXf(np.ones((3, len(index)), np.float32))
+            shading = shade_points(self.avatar, parameters, self.stage.k_s[1], points[index], white)
+            found.append((shading.diffuse.numpy(), shading.specular.numpy()))
+        irradiance, specular = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
+        return irradiance, specular
+
+    def _shift_network(self, state: FitState, points: PhotoPoints, seen: np.ndarray) -> np.ndarray:
+        """The parameters of the diffuse albedo's network, their last biases shifted so that in the median over the
+        photo's points its refined albedo is the one `seen` [3, N]: what the photo does not show has the same level."""
+        facing = np.flatnonzero(_facing(points) > _OBLIQUE[1])
+        chosen = facing[:: max(1, -(-len(facing) // CHUNK))]
+        network = state.avatar["diffuse_albedo"].copy()
+        if len(chosen):
+            albedo = _refined_albedo(self.avatar, state, points[chosen], self.stage.k_r)
+            wanted, known = (logit(np.clip(a, 1e-3, _HIGHEST_ALBEDO)) for a in (seen[:, chosen], albedo))
+            network[-3:] += np.median(wanted - known, axis=1).astype(np.float32)
+        return network
+
+
+def find_light_factor(radiance: np.ndarray, irradiance: np.ndarray, specular: np.ndarray, luminance: float) -> float:
+    """The factor of a light, with irradiance over π and specular radiance [3, n], at which the albedo of skin of that
+    radiance [3, n] has this luminance in the median; 1 where there is no skin, or none within 3 stops."""
+
+    def excess(stops: float) -> float:
+        light = 2.0**stops
+        albedo = np.maximum(radiance - light * specular, 0) / (light * np.maximum(irradiance, 1e-6))
+        return float(np.median(np.array(LUMINANCE) @ albedo)) - luminance
+
+    if not radiance.size or not excess(-_MOST_STOPS) > 0 > excess(_MOST_STOPS):
+        return 1.0
+    return float(2.0 ** brentq(excess, -_MOST_STOPS, _MOST_STOPS, xtol=1e-3))
+
+
+def draw_detail(surface: PhotoSurface, irradiance: np.ndarray, specular: np.ndarray) -> dict[str, np.ndarray]:
+    """The tensors of `sira_mi.avatar.detail` for a photo with this irradiance over π and specular radiance [3, N] at
+    the points of its surface."""
+    points, portrait, camera = surface.points, surface.portrait, surface.portrait.camera
+    size = portrait.mask.shape
     within = distance_transform_edt(_spread(np.ones_like(points.t), points, size, margin=0)[..., 0])
-    weight = _rise(cosine, _OBLIQUE) * _rise(within[points.row, points.column], _OUTLINE)
-    irradiance, specular = _shade_photo(task.prior, state, surface, k_s)
-    factor = find_level(surface, irradiance, specular)
-    irradiance, specular = factor * irradiance, factor * specular
-    seen = np.clip((surface.radiance - specular) / irradiance, 0, _HIGHEST_ALBEDO)
-    network = shift_network(task.prior, state, points, seen, k_r)
-    layers = _spread(np.concatenate([irradiance, specular, weight]), points, size)
+    weight = _rise(_facing(points), _OBLIQUE) * _rise(within[points.row, points.column], _OUTLINE)
+    layers = _spread(np.concatenate([irradiance, specular, weight[None]]), points, size)
+    place = np.concatenate([points.origin + points.t * points.view, np.ones_like(points.t)])
     depth = _spread((camera.world_to_camera[:3] @ place)[2:], points, size)[..., 0]
 
     photo = portrait.image if portrait.sharp is None else portrait.sharp
-    height, width = photo.shape[:2]
-    layers = cv2.resize(layers, (width, height), interpolation=cv2.INTER_LINEAR)
+    layers = cv2.resize(layers, photo.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     albedo = np.clip((photo - layers[..., 3:6]) / np.maximum(layers[..., :3], 1e-6), 0, _HIGHEST_ALBEDO)
     to_unit = np.diag([1 / camera.width, 1 / camera.height, 1.0])
     return {
         "detail": np.concatenate([albedo, layers[..., 6:]], axis=-1).astype(np.float32),
         "detail_depth": depth,
         "detail_camera": (to_unit @ camera.K @ camera.world_to_camera[:3]).astype(np.float32),
-        "diffuse_albedo": network,
-    }, factor
+    }
 
 
-def shift_network(avatar: Avatar, state: FitState, points: PhotoPoints, seen: np.ndarray, k_r: float) -> np.ndarray:
-    """The parameters of the diffuse albedo's network, their last biases shifted so that in the median over the photo's
-    points its refined albedo is the one `seen` [3, N]: what the photo does not show goes on at the same level."""
+def _refined_albedo(avatar: Avatar, state: FitState, points: PhotoPoints, k_r: float) -> np.ndarray:
+    """The networks' diffuse albedo [3, N]."""
     parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
-    octaves = avatar.architecture.refinement_octaves
-    chosen = np.flatnonzero(-(points.normal * points.view).sum(axis=0) > _OBLIQUE[1])[:: max(1, len(points.row) // CHUNK)]
-    at = points[chosen]
-    fine = albedo_refinement(
-        decoder(avatar, "albedo_refinement", parameters), octaves, mi.TensorXf(at.x_ref), mi.TensorXf(at.gamma)
-    )
-    albedo = refine_albedo(base_albedo(avatar, parameters, at), fine, k_r).numpy()
-    odds = [logit(np.clip(a, 1e-3, _HIGHEST_ALBEDO)) for a in (seen[:, chosen], albedo)]
-    network = state.avatar["diffuse_albedo"].copy()
-    if len(chosen):
-        network[-3:] += np.median(odds[0] - odds[1], axis=1).astype(np.float32)
-    return network
+    network, octaves = decoder(avatar, "albedo_refinement", parameters), avatar.architecture.refinement_octaves
+    fine = albedo_refinement(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma))
+    return refine_albedo(base_albedo(avatar, parameters, points), fine, k_r).numpy()
 
 
-def find_level(surface: PhotoSurface, irradiance: np.ndarray, specular: np.ndarray) -> float:
-    """The factor of the light, of irradiance over π and specular radiance [3, N] at the photo's points, with which the
-    albedo of bare skin has the luminance that the photo's cues say; 1 where no skin is seen."""
-    if surface.skin is None:
-        return 1.0
-    near = np.zeros(surface.portrait.mask.shape, bool)
-    near[find_near_landmarks(surface.portrait.landmarks, BARE_SKIN, surface.portrait.mask > 0.5)] = True
-    chosen = near[surface.points.row, surface.points.column]
-    radiance, diffuse, specular = (a[:, chosen] for a in (surface.radiance, irradiance, specular))
-
-    def excess(stops: float) -> float:
-        light = 2.0**stops
-        albedo = np.maximum(radiance - light * specular, 0) / (light * diffuse)
-        return float(np.median(np.array(LUMINANCE) @ albedo)) - surface.skin.luminance
-
-    if not excess(-_MOST_STOPS) > 0 > excess(_MOST_STOPS):
-        return 1.0
-    return float(2.0 ** brentq(excess, -_MOST_STOPS, _MOST_STOPS, xtol=1e-3))
-
-
-def _shade_photo(avatar: Avatar, state: FitState, surface: PhotoSurface, k_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Irradiance over π and specular radiance [3, N] at the photo's points, in the photo's light."""
-    parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
-    count = surface.radiance.shape[1]
-    pieces = np.array_split(np.arange(count), max(1, -(-count // CHUNK)))
-    found = [_shade(avatar, parameters, surface.points[index], k_s) for index in pieces]
-    irradiance, specular = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
-    return np.maximum(irradiance, _LEAST_IRRADIANCE * irradiance.mean()), specular
-
-
-def _shade(avatar: Avatar, parameters: dict, points: PhotoPoints, k_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Irradiance over π and specular radiance [3, n] at some points."""
-    white = mi.TensorXf(np.ones((3, len(points.row)), np.float32))
-    shading = shade_points(avatar, parameters, k_s, points, white)
-    octaves = avatar.architecture.refinement_octaves
-    network = decoder(avatar, "light_refinement", parameters)
-    factor = np.exp(light_refinement(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma)).numpy())
-    return factor * shading.diffuse.numpy(), factor * shading.specular.numpy()
+def _facing(points: PhotoPoints) -> np.ndarray:
+    """Cosines [N] between normals and the directions to the camera."""
+    return -(points.normal * points.view).sum(axis=0)
 
 
 def _rise(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:

@@ -23,7 +23,6 @@ from sira_mi.export.mesh import write_mesh
 from sira_mi.export.scene_file import write_scene
 from sira_mi.files import check_outputs, hold_folder, write_exr, write_png
 from sira_mi.fit import output
-from sira_mi.fit.detail import find_detail
 from sira_mi.fit.driver import Progress, load_progress, run_stages, save_progress
 from sira_mi.fit.measure import measure_fit
 from sira_mi.fit.memory import peak_memory
@@ -105,8 +104,6 @@ def _fit_in_folder(request: FitRequest, work: Path, started: float) -> bool:
 
     progress, complete = run_fit(request, task)
     avatar = assemble_avatar(task.prior, progress, task.settings, task.portrait.exposure)
-    if "light_refinement" in progress.state.avatar:  # not where the fit stopped early
-        avatar = avatar.with_tensors(**find_detail(task, progress.state, avatar.k_s))
     save_avatar(request.out / "avatar.safetensors", avatar)
     report = {
         "quality": request.quality,
@@ -229,6 +226,7 @@ def identify(task: FitTask, seed: int) -> str:
     portrait, digest = task.portrait, hashlib.sha256()
     for array in (
         portrait.image,
+        portrait.image if portrait.sharp is None else portrait.sharp,
         portrait.mask,
         portrait.landmarks,
         portrait.head_landmarks,

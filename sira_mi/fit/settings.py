@@ -1,9 +1,10 @@
 """The shipped fits: the stages of each quality in order, their lengths and learning rates."""
 
 from sira_mi.fit.appearance import AlbedoStage, LightStage, SpecularStage
+from sira_mi.fit.detail import DetailStage
 from sira_mi.fit.geometry import GeometryStage, LatentStage
 from sira_mi.fit.polish import PolishStage
-from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
+from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.shading import ShadingStage
 from sira_mi.fit.stage import FitSettings, Stage
 
@@ -49,11 +50,12 @@ def schedule_stages(geometry: float, appearance: float, refinement: float) -> tu
         LightStage("light", steps(120), {"z_l": 1e-1, "illumination": 1e-3}),
         AlbedoStage("albedo", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 1e-1}),
         SpecularStage("specular", steps(120), {"z_l": 3e-2, "illumination": 5e-4, "z_a": 3e-2, "z_s": 6e-2}),
-        RefinementStage(
+        AlbedoRefinementStage(
             "refinement",
             round(800 * refinement),
-            {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3, "light_refinement": 5e-3},
+            {"z_l": 6e-3, "illumination": 1e-4, "z_s": 1e-2, "albedo_refinement": 5e-3},
         ),
+        DetailStage("detail", 0, {}),
     )
 
 
