@@ -25,11 +25,11 @@ from sira_mi.fit.driver import Progress, load_progress, save_progress
 from sira_mi.fit.memory import peak_memory
 from sira_mi.fit.output import label_tile
 from sira_mi.fit.rays import find_modelled_pixels, pixel_rays
-from sira_mi.fit.refinement import RefinementStage
 from sira_mi.fit.state import FitState
 from sira_mi.portrait.camera import Camera
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.relight.pictures import psnr
+from studies.portraits.shared_residual import SharedResidualStage
 
 TINY = tiny_fit(steps=6)
 
@@ -201,7 +201,7 @@ def test_checkpoint_of_another_fit_is_refused(tmp_path):
     state = FitState({"z_sdf": np.ones(3, np.float32)}, unpolished={"z_sdf": np.zeros(3, np.float32)})
     save_progress(path, Progress(state, step=5, seconds={}, losses={}), "this fit")
     loaded = load_progress(path, "this fit")
-    assert loaded.step == 5 and loaded.optimizer is None and loaded.state.albedo_shares is None
+    assert loaded.step == 5 and loaded.optimizer is None
     for before, after in ((state, loaded.state), (state.before_polish(), loaded.state.before_polish())):
         assert np.array_equal(before.avatar["z_sdf"], after.avatar["z_sdf"]) and np.array_equal(before.pose, after.pose)
     with pytest.raises(InputError, match="another photo"):
@@ -221,7 +221,7 @@ def test_a_fit_is_identified_by_all_that_it_depends_on(fit, tmp_path, monkeypatc
     task = FitTask(photo, load_avatar(), PRIOR, TINY, tmp_path, TINY.plan())
     brighter = replace(task, portrait=replace(photo, image=photo.image + 1))
     *others, refinement, detail = TINY.stages
-    shared = RefinementStage(**{f.name: getattr(refinement, f.name) for f in fields(refinement)})
+    shared = SharedResidualStage(**{f.name: getattr(refinement, f.name) for f in fields(refinement)})
     tasks = (task, brighter, replace(task, settings=replace(TINY, stages=(*others, shared, detail))))
     identities = [identify(one, seed=0) for one in tasks] + [identify(task, seed=1)]
     monkeypatch.setattr("sira_mi.__version__", "0.0.0")

@@ -8,12 +8,13 @@ from conftest import camera
 from sira_mi.avatar.file import PRIOR, load_avatar
 from sira_mi.fit.appearance import AppearanceStage
 from sira_mi.fit.detail import DetailStage
-from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
+from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.shading import ShadingStage
 from sira_mi.fit.stage import FitTask
 from sira_mi.portrait.portrait import Portrait
 from studies.portraits.methods import BY_NAME, METHODS, is_geometry
+from studies.portraits.shared_residual import SharedResidualStage
 
 DRAFT = QUALITIES["draft"]
 
@@ -34,7 +35,7 @@ def test_ablations_are_those_of_the_paper():
     assert moved("b.4") - moved("b.3") == {"z_sdf", "deformation"}
     for quality in QUALITIES.values():
         assert [type(stage) for stage in BY_NAME["b.4"].settings(quality).stages].count(ShadingStage) == 1
-        for name, refined in {"b.7": AlbedoRefinementStage, "b.8": RefinementStage}.items():
+        for name, refined in {"b.7": AlbedoRefinementStage, "b.8": SharedResidualStage}.items():
             assert type(BY_NAME[name].settings(quality).stages[-1]) is refined
         assert type(BY_NAME["b.3"].settings(quality).stages[-1]) is DetailStage
     assert moved("b.5") == {"z_l", "illumination", "z_s", "albedo_refinement"}

@@ -5,6 +5,7 @@ the pixel that it is projected to, unless something lies before it, by a depth m
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,8 +24,10 @@ class AlbedoDetail:
     depth."""
 
     def __init__(self, tensors: Mapping[str, np.ndarray]):
+        make: Any = mi.Texture2f  # the stubs call it an object
+
         def texture(image, kind):
-            return mi.Texture2f(mi.TensorXf(image), filter_mode=kind, wrap_mode=dr.WrapMode.Clamp)
+            return make(mi.TensorXf(image), filter_mode=kind, wrap_mode=dr.WrapMode.Clamp)
 
         self.albedo = texture(tensors["detail"], dr.FilterMode.Linear)
         self.depth = texture(tensors["detail_depth"][..., None], dr.FilterMode.Nearest)

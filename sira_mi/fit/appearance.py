@@ -14,7 +14,6 @@ from sira_mi.avatar.decoders import diffuse_albedo
 from sira_mi.avatar.file import Avatar
 from sira_mi.decisions import Decision
 from sira_mi.fields.columns import evaluate_in_chunks, to_array
-from sira_mi.fit.residual import albedo_variances
 from sira_mi.fit.shaded import Arrays, PhotoPoints, Shading, base_albedo, decoder, shade_points
 from sira_mi.fit.skin import find_skin_patches
 from sira_mi.fit.stage import FitTask, Problem, Stage
@@ -86,7 +85,6 @@ class PhotoSurface:
         self.points = task.photo_points(self.portrait, head)
         self.skin = find_skin_patches(self.portrait, self.points)
         row, column = self.points.row, self.points.column
-        self.albedo_variances = albedo_variances(self.portrait, row, column)
         self.radiance = np.ascontiguousarray(self.portrait.image[row, column].T, dtype=np.float32)  # [3, N]
 
 

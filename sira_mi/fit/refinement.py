@@ -1,22 +1,19 @@
-"""The refinement stage of section 3.2.2: a network adds to the base albedo what the prior lacks (eqs 11 to 13). Other
-than in the paper, a second network refines the light, and the two share the photo's residual (`residual`)."""
+"""The refinement stage of section 3.2.2: a network adds to the base albedo what the prior lacks (eqs 11 to 13)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from sira_mi.avatar.decoders import albedo_refinement, light_refinement, refine_albedo
+from sira_mi.avatar.decoders import albedo_refinement, refine_albedo
 from sira_mi.decisions import Decision
 from sira_mi.fields.columns import to_array
-from sira_mi.fields.mlp import initial_parameters
 from sira_mi.fit.appearance import AppearanceProblem, AppearanceStage, AppearanceWeights, share_surface
-from sira_mi.fit.residual import albedo_shares, light_variances, log_residual, share_loss
-from sira_mi.fit.shaded import Arrays, PhotoPoints, Shading, decoder, shade_points
+from sira_mi.fit.shaded import Arrays, Shading, decoder, shade_points
 from sira_mi.fit.stage import FitTask, Problem
 from sira_mi.fit.state import FitState
 from sira_mi.optimisation import losses
@@ -32,13 +29,12 @@ class RefinementWeights(AppearanceWeights):
     lambda_8: float = 0.5  # eq. 13, refinement in shadows
     lambda_9: float = 1.0  # eq. 13, refinement in reflections
     refinement: float = 0.1  # eq. 12
-    shares: float = 0.05  # on the distance of albedo's and light's parts of the residual from their shares
     smoothness: float = 0.02  # ‖a^r(x) − a^r(x + ε)‖, keeps noise out of the refinement
 
 
 @dataclass(frozen=True)
 class AlbedoRefinementStage(AppearanceStage):
-    """The refinement of the paper: the albedo takes all of the residual."""
+    """The albedo takes all that eq. 8 with the base albedo leaves of the photo."""
 
     k_s: tuple[float, float] = (1.0, 1.0)
     k_r: float = 1.0
@@ -49,14 +45,6 @@ class AlbedoRefinementStage(AppearanceStage):
 
     def decisions(self) -> tuple[Decision, ...]:
         return (self._fixed_base(),)
-
-
-@dataclass(frozen=True)
-class RefinementStage(AlbedoRefinementStage):
-    """Albedo and light share the residual."""
-
-    def problem(self, task: FitTask, state: FitState) -> Problem:
-        return RefinementProblem(self, task, share_surface(task, state))
 
 
 @dataclass(frozen=True)
@@ -120,43 +108,6 @@ class AlbedoRefinementProblem(AppearanceProblem):
         shadow = dr.maximum(_norm_1(points.base) - _norm_1(base_diffuse), 0.0)
         w = dr.detach(weights.lambda_8 * shadow + weights.lambda_9 * _norm_1(shading.specular))
         return losses.mean(losses.norm(points.fine) * w)
-
-
-class RefinementProblem(AlbedoRefinementProblem):
-    """The losses of a refinement of albedo and light."""
-
-    def start(self, state: FitState) -> FitState:
-        """Settles the albedo's shares of the residual; the refinement of the light starts from the factor 1."""
-        self.refresh(state)
-        points, index = self.surface.points, self._draw(np.random.default_rng(0))
-
-        def radiance(points: PhotoPoints) -> np.ndarray:
-            diffuse, specular = self._base_radiance(points)
-            return diffuse + specular
-
-        diffuse, specular = self._base_radiance(points[index])
-        residual = log_residual(self.surface.radiance[:, index] - specular, diffuse)
-        light = light_variances(radiance, points, index, seed=0)
-        network = self.avatar.architecture.networks["light_refinement"]
-        parameters = initial_parameters(network, np.random.default_rng(0), output_scale=0.0)
-        shares = albedo_shares(residual, index, self.surface.albedo_variances, light)
-        return replace(state.with_parameters({"light_refinement": parameters}), albedo_shares=shares)
-
-    def refresh(self, state: FitState) -> None:
-        super().refresh(state)
-        if state.albedo_shares is not None:  # None before the start
-            self._shares = state.albedo_shares
-
-    def losses(self, parameters: Arrays, step: int, rng: np.random.Generator) -> Arrays:
-        points = self._shade(parameters, step, rng)
-        radiance = points.shading.diffuse + points.shading.specular
-        network = decoder(self.avatar, "light_refinement", points.current)
-        octaves = self.avatar.architecture.refinement_octaves
-        of_light = light_refinement(network, octaves, points.x_ref, points.gamma)
-        terms = self._losses_of(points, radiance * dr.exp(of_light), rng)
-        of_albedo = self._shares[:, points.index]
-        terms["shares"] = self.stage.weights.shares * share_loss(points.base, points.albedo, of_light, of_albedo)
-        return terms
 
 
 def _norm_1(v: Any) -> Any:

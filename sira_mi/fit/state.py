@@ -19,7 +19,6 @@ class FitState:
     avatar: dict[str, np.ndarray]  # the avatar's networks [parameters] and latent codes [dimension]
     # Rotation vector (radians) and translation (scene units) [6] of points before they enter the field.
     pose: np.ndarray = field(default_factory=lambda: np.zeros(6, np.float32))
-    albedo_shares: np.ndarray | None = None  # [2, N] of the photo's residual, from the start of the refinement on
     unpolished: dict[str, np.ndarray] | None = None  # the parameters that the polish moves, as they were before it
 
     @classmethod
@@ -44,8 +43,6 @@ class FitState:
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays by name, for a file; `from_arrays` reads them back."""
         arrays = {f"avatar/{name}": value for name, value in self.avatar.items()} | {POSE: self.pose}
-        if self.albedo_shares is not None:
-            arrays["albedo_shares"] = self.albedo_shares
         return arrays | {f"unpolished/{name}": value for name, value in (self.unpolished or {}).items()}
 
     @classmethod
@@ -55,7 +52,7 @@ class FitState:
         def group(prefix: str) -> dict[str, np.ndarray]:
             return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
-        return cls(group("avatar/"), arrays[POSE], arrays.get("albedo_shares"), group("unpolished/") or None)
+        return cls(group("avatar/"), arrays[POSE], group("unpolished/") or None)
 
 
 def initial_state(prior: Avatar, seed: int) -> FitState:

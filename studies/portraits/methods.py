@@ -9,7 +9,7 @@ alone tell, and the appearance of b.3.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from sira_mi.fields.sdf import SdfField
 from sira_mi.fit.appearance import AppearanceStage
 from sira_mi.fit.detail import DetailStage
 from sira_mi.fit.geometry import GeometryStage, LatentProblem, LatentStage, share_scene
-from sira_mi.fit.refinement import AlbedoRefinementStage, RefinementStage
+from sira_mi.fit.refinement import AlbedoRefinementStage
 from sira_mi.fit.settings import add_shading, polish_stage
 from sira_mi.fit.shaded import DIRECTIONS, Arrays, PhotoPoints, find_masked_points
 from sira_mi.fit.shading import ShadingStage
@@ -29,6 +29,7 @@ from sira_mi.fit.state import FitState
 from sira_mi.optimisation.losses import squared_norm
 from sira_mi.portrait.portrait import Portrait
 from sira_mi.training.af_sm import initial_appearance_model
+from studies.portraits.shared_residual import SharedResidualStage
 
 # Of b.4, at draft quality.
 _SHADING_STEPS = 40
@@ -165,9 +166,8 @@ def _share_the_residual(shipped: Stages) -> Stages:
     def with_light(stage: Stage) -> Stage:
         if not isinstance(stage, AlbedoRefinementStage):
             return stage
-        values = {field.name: getattr(stage, field.name) for field in fields(stage)}
         rates = {**stage.rates, "light_refinement": stage.rates["albedo_refinement"]}
-        return RefinementStage(**{**values, "rates": rates})
+        return SharedResidualStage(stage.name, stage.steps, rates)
 
     return tuple(map(with_light, _without_detail(shipped)))
 

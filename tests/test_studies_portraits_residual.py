@@ -38,7 +38,7 @@ def deviating(rng, grey, colour):
 def test_the_shares_are_the_best_linear_estimate_of_the_albedo(variant, albedo, light):
     """Of a photo made of independent deviations of albedo and light, where the light's are known, and the albedo's as
     well or larger than expected: no other factor of grey or colour leaves a smaller error of the albedo."""
-    from sira_mi.fit.residual import albedo_shares, log_residual
+    from studies.portraits.residual import albedo_shares, log_residual
 
     rng = np.random.default_rng(3)
     true = deviating(rng, *albedo)
@@ -60,7 +60,7 @@ def test_the_shares_are_the_best_linear_estimate_of_the_albedo(variant, albedo, 
 
 def test_a_tie_of_another_colour_does_not_make_all_of_a_photo_albedo(variant):
     """A tenth of the pixels is far off, the rest as the light explains."""
-    from sira_mi.fit.residual import albedo_shares
+    from studies.portraits.residual import albedo_shares
 
     residual = deviating(np.random.default_rng(1), 0.1, 0.04)
     residual[0, : COUNT // 10] += 2.0
@@ -87,7 +87,7 @@ def points_of_a_ball(count: int):
 def test_the_light_is_uncertain_where_it_grazes_and_where_shadows_end(variant):
     """A distant light from +z that the wall blocks: small in the middle, larger towards the terminator, largest at the
     shadow's edge; of a coloured light next to a white one colour varies too. A sky of one radiance leaves the least."""
-    from sira_mi.fit.residual import light_variances
+    from studies.portraits.residual import light_variances
 
     points = points_of_a_ball(6000)
     chosen = np.arange(0, 6000, 2)
@@ -111,7 +111,7 @@ def test_the_light_is_uncertain_where_it_grazes_and_where_shadows_end(variant):
 
 def test_eyes_and_mouth_may_deviate_further_than_skin(variant, portrait):
     """Where landmarks say that eyes are, or teeth; without landmarks, all is alike."""
-    from sira_mi.fit.residual import albedo_variances
+    from studies.portraits.residual import albedo_variances
 
     row, column = (a.ravel() for a in np.mgrid[0:SIZE, 0:SIZE])
     grey, colour = albedo_variances(portrait, row, column).reshape(2, SIZE, SIZE)
@@ -132,7 +132,7 @@ def test_eyes_and_mouth_may_deviate_further_than_skin(variant, portrait):
 
 def test_the_loss_is_zero_at_the_shares_alone(variant):
     """And its gradient moves the refinement of the light towards them."""
-    from sira_mi.fit.residual import share_loss
+    from studies.portraits.residual import share_loss
 
     rng = np.random.default_rng(4)
     base = rng.uniform(0.1, 0.5, (3, 50))
