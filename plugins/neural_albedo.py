@@ -88,6 +88,10 @@ class NeuralAlbedo(mi.Texture):
     shape. Two heads need two materials, and `optimize=False` where these are alike, for Mitsuba makes one of them
     otherwise. Instances of its shape show the shape's albedo, without gradients to the shape.
 
+    The avatar of a fit also holds a detail: the diffuse albedo of all that its photo shows, as a picture in the photo's
+    camera. Points that the photo shows, by a depth map, take it in place of the networks' albedo, `baked` or not. It is
+    as sharp as the photo, fixed in the field's coordinates, and has no gradients.
+
     Works in any stock BSDF and inside symbolic loops, where networks are evaluated as cooperative vectors. Call
     `params.update()` after enabling gradients. If one channel is asked of a three-channel texture, it returns the
     luminance; if three are asked of a one-channel texture, it returns grey.
@@ -95,8 +99,8 @@ class NeuralAlbedo(mi.Texture):
     The networks dominate the cost of path tracing a head, and Mitsuba compiles the networks of all live textures into
     every kernel, even those of other scenes. A `baked` texture avoids this: the shape stores the albedo as the mesh
     attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (with a number appended if a head has several of one
-    kind) and updates it whenever parameters change through the scene or the shape. Its detail is limited by the mesh;
-    use a `voxel` of 0.03 or less. It has no gradients: enabling one raises RuntimeError at the next render, as does
+    kind) and updates it whenever parameters change through the scene or the shape. The networks' albedo is limited by
+    the mesh; use a `voxel` of 0.03 or less. It has no gradients: enabling one raises RuntimeError at the next render, as does
     using it outside a `neural_sdf`. `sira_sg` evaluates the networks even if a texture is baked, unless its `exact` is
     false.
 
