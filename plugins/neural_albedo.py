@@ -100,9 +100,9 @@ class NeuralAlbedo(mi.Texture):
     every kernel, even those of other scenes. A `baked` texture avoids this: the shape stores the albedo as the mesh
     attribute `vertex_diffuse_albedo` or `vertex_specular_albedo` (with a number appended if a head has several of one
     kind) and updates it whenever parameters change through the scene or the shape. The networks' albedo is limited by
-    the mesh; use a `voxel` of 0.03 or less. It has no gradients: enabling one raises RuntimeError at the next render, as does
-    using it outside a `neural_sdf`. `sira_sg` evaluates the networks even if a texture is baked, unless its `exact` is
-    false.
+    the mesh; use a `voxel` of 0.03 or less. It has no gradients: enabling one raises RuntimeError at the next render,
+    as does using it outside a `neural_sdf`. `sira_sg` evaluates the networks even if a texture is baked, unless its
+    `exact` is false.
 
     Source: SIRA (Caselles et al. 2022), sections 3.1.3 and 3.2.2.
 

@@ -9,7 +9,6 @@ from conftest import camera
 
 from sira_mi.avatar.detail import AlbedoDetail
 from sira_mi.avatar.file import DETAIL, load_avatar, save_avatar
-from sira_mi.conventions import LUMINANCE
 from sira_mi.errors import InputError
 from sira_mi.fit.settings import QUALITIES
 from sira_mi.fit.state import FitState
@@ -139,16 +138,16 @@ def test_a_fit_finds_the_stripes_of_a_photo(variant, avatar, tmp_path):
     assert np.quantile(np.abs(columns.T[sure] - expected[sure, :3]), 0.9) < 0.02
 
 
-def test_the_light_is_scaled_to_the_luminance_of_the_skin(variant):
-    """Skin under a light 1.7 times as bright as the fit's, specular term included; where none is seen, and where no
-    light within three stops does it, the light stays as it is."""
-    from sira_mi.fit.detail import find_light_factor
+def test_the_light_is_scaled_to_the_tone_of_the_skin(variant):
+    """Skin under a light brighter than the fit's by a factor a channel, specular term included; where none is seen, and
+    in a channel where no light within three stops does it, the light stays as it is."""
+    from sira_mi.fit.detail import find_light_factors
 
     rng = np.random.default_rng(0)
     irradiance, specular = rng.uniform(0.2, 0.8, (3, 51)), rng.uniform(0.0, 0.05, (3, 51))
-    albedo = np.array([[0.3], [0.2], [0.1]])
-    luminance = float(LUMINANCE @ albedo[:, 0])
-    radiance = 1.7 * (albedo * irradiance + specular)
-    assert find_light_factor(radiance, irradiance, specular, luminance) == pytest.approx(1.7, rel=2e-3)
-    assert find_light_factor(radiance[:, :0], irradiance[:, :0], specular[:, :0], luminance) == 1
-    assert find_light_factor(100 * radiance, irradiance, specular, luminance) == 1
+    tone, factors = np.array([0.3, 0.2, 0.1]), np.array([1.7, 0.6, 1.0])
+    radiance = factors[:, None] * (tone[:, None] * irradiance + specular)
+    np.testing.assert_allclose(find_light_factors(radiance, irradiance, specular, tone), factors, rtol=2e-3)
+    assert (find_light_factors(radiance[:, :0], irradiance[:, :0], specular[:, :0], tone) == 1).all()
+    radiance[0] *= 100
+    np.testing.assert_allclose(find_light_factors(radiance, irradiance, specular, tone), [1, 0.6, 1], rtol=2e-3)

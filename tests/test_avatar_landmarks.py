@@ -10,19 +10,19 @@ from conftest import SMALL, one_line, small_avatar
 from safetensors.numpy import load_file, save_file
 
 from sira_mi.avatar.file import load_avatar, save_avatar
-from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
+from sira_mi.avatar.landmark_model import LandmarkModel
 from sira_mi.conventions import LANDMARKS
 from sira_mi.errors import InputError
 from sira_mi.portrait.face import Face
 from sira_mi.portrait.head_landmarks import (
     LandmarkCorrection,
-    align_face,
     correct_landmarks,
     find_upright_axes,
     find_view_direction,
     load_shipped_correction,
 )
-from studies.portraits.measure_landmarks import Observation, fit_correction, measure_held_out_errors
+from studies.head_landmarks import landmarks_of
+from studies.portraits.measure_landmarks import Observation, align_face, fit_correction, measure_held_out_errors
 from studies.priors import fit_landmark_model
 from studies.priors.landmark_regression import landmark_tensors
 

@@ -134,7 +134,7 @@ def test_each_equation_is_in_one_place():
 def test_readme_snippets_run(avatar_path, tmp_path, monkeypatch):
     """The Python of README runs as printed, but for the avatar's path and the size of the picture."""
     from sira_mi.sg.lights_io import write_lights
-    from sira_mi.sg.lobes import initial_lobes
+    from studies.initial_lobes import initial_lobes
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "me").mkdir()

@@ -19,6 +19,7 @@ from sira_mi.fields.directions import fibonacci_directions  # noqa: E402
 from sira_mi.sg import brdf, integrals, lobes, shading  # noqa: E402
 from sira_mi.sg import fit_environment as fit  # noqa: E402
 from studies.data import read_figures  # noqa: E402
+from studies.initial_lobes import initial_lobes  # noqa: E402
 from studies.numerics import physg, worst_errors  # noqa: E402
 
 SHARPNESS = np.geomspace(1e-3, 1e5, 33)
@@ -52,7 +53,7 @@ def random_points(count, seed=0, lowest=0.1):
 def shading_inputs(points=64, count=6, seed=0):
     normal, view = random_points(points, seed)
     generator = np.random.default_rng(seed + 1)
-    set_of_lobes = lobes.initial_lobes(count, seed=seed)
+    set_of_lobes = initial_lobes(count, seed=seed)
     set_of_lobes[:, 3] = generator.uniform(2.0, 60.0, count)
     return mi.Vector3f(normal), mi.Vector3f(view), mi.Float(generator.uniform(0.1, 0.9, points)), set_of_lobes
 
@@ -311,7 +312,7 @@ def test_gradients_match_differences(which):
 def test_roughness_gradient_matches_differences():
     """Through the tables too: grazing views, and roughness from 0.15 to 0.9."""
     normal, view = random_points(64, 9, lowest=0.05)
-    packed = mi.TensorXf(lobes.initial_lobes(8))
+    packed = mi.TensorXf(initial_lobes(8))
     roughness = np.linspace(0.15, 0.9, 64)
 
     def specular(value):
@@ -381,7 +382,7 @@ def test_extreme_inputs_give_finite_values_and_gradients():
     view[:, 10:20] -= 2 * (normal * view).sum(axis=0)[10:20] * normal[:, 10:20]
     view[:, 20:25] -= (normal * view).sum(axis=0)[20:25] * normal[:, 20:25]
     view /= np.linalg.norm(view, axis=0)
-    set_of_lobes = lobes.initial_lobes(30)
+    set_of_lobes = initial_lobes(30)
     set_of_lobes[:, 3] = [0.0, *np.geomspace(1e-6, 1e7, 29)]
     set_of_lobes[:3, :3] = -normal.T[:3]
     set_of_lobes[3:6, :3] = normal.T[3:6]
@@ -399,12 +400,12 @@ def test_extreme_inputs_give_finite_values_and_gradients():
 
 
 def test_initial_lobes_have_the_energy_asked_for():
-    energy = lobes.lobe_integral(lobes.initial_lobes(128)[:, 3:4]) * lobes.initial_lobes(128)[:, 4:]
+    energy = lobes.lobe_integral(initial_lobes(128)[:, 3:4]) * initial_lobes(128)[:, 4:]
     np.testing.assert_allclose(energy.sum(axis=0), 2 * np.pi, rtol=1e-5)
 
 
 def test_lobes_evaluate_alike_in_numpy_and_drjit():
-    values = lobes.initial_lobes(5)
+    values = initial_lobes(5)
     directions = fibonacci_directions(50)
     packed = lobes.interleave([mi.Float(column) for column in values.T])
     np.testing.assert_array_equal(packed.numpy(), values.ravel())

@@ -33,7 +33,7 @@ class AvatarArchitecture:
     specular_width: int = 32
     specular_depth: int = 2
     specular_latent: int = 8  # dimension of z_s
-    refinement_octaves: int = 9
+    refinement_octaves: int = 5
     refinement_width: int = 96
     refinement_depth: int = 3
     lobes: int = 48  # N_l, number of spherical Gaussians of the illumination decoder

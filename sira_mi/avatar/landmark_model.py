@@ -63,12 +63,3 @@ class LandmarkModel:
         row: mi.TensorXf = dr.reshape(placed, (1, 3 * placed.shape[1]))
         w = (row - self.placed) @ self.across
         return dr.reshape(self.mean + w @ self.offsets, placed.shape)
-
-
-def landmarks_of(prior: Avatar, field: SdfField) -> np.ndarray:
-    """The landmarks [468, 3] of a head of the prior, given its field without motion; NaN where unknown."""
-    known, x_ref = reference_landmarks(prior)
-    start = np.ascontiguousarray(prior.tensors["landmarks"][known].T)
-    landmarks = np.full((len(known), 3), np.nan, np.float32)
-    landmarks[known] = LandmarkModel(prior)(place_landmarks(field, x_ref, start)).numpy().T
-    return landmarks

@@ -187,10 +187,10 @@ class LightProblem(AppearanceProblem):
         return state.with_parameters({"illumination": scale_light(self.avatar, state.avatar["illumination"], factor)})
 
 
-def scale_light(avatar: Avatar, illumination: np.ndarray, factor: float) -> np.ndarray:
-    """Parameters of the illumination decoder whose lobes are about `factor` times as bright, by the bias of their
-    log-amplitudes."""
+def scale_light(avatar: Avatar, illumination: np.ndarray, factor: float | np.ndarray) -> np.ndarray:
+    """Parameters of the illumination decoder whose lobes are about `factor` times as bright, one number or [3], by the
+    bias of their log-amplitudes."""
     flat = illumination.copy()
     bias = flat[-7 * avatar.architecture.lobes :].reshape(-1, 7)
-    bias[:, 4:7] += np.float32(np.log(max(factor, 1e-6)))
+    bias[:, 4:7] += np.log(np.maximum(factor, 1e-6)).astype(np.float32)
     return flat

@@ -4,8 +4,8 @@ Eq. 8 is linear in the diffuse albedo: the albedo of a pixel is the photo's radi
 irradiance. Both come from the fit and are smooth, so that they are evaluated at the working size. Eyes, brows, lips,
 hair and cloth are not smooth, and no network holds them. The paper has no such stage.
 
-The level of light and albedo together is ambiguous: first the light is scaled so that bare skin has the luminance that
-the photo's cues say (`sira_mi.fit.skin`)."""
+Level and colour of light and albedo together are ambiguous: first the light is scaled so that bare skin has the
+luminance that the photo's cues say (`sira_mi.fit.skin`), in the colour that skin of that luminance has."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from scipy.special import logit
 
 from sira_mi.avatar.decoders import albedo_refinement, refine_albedo
 from sira_mi.avatar.file import Avatar
-from sira_mi.conventions import LUMINANCE
 from sira_mi.fields.columns import CHUNK
 from sira_mi.fit.appearance import PhotoSurface, scale_light, share_surface
 from sira_mi.fit.shaded import Arrays, PhotoPoints, base_albedo, decoder, shade_points
@@ -33,8 +32,7 @@ from sira_mi.portrait.landmarks import BARE_SKIN
 _HIGHEST_ALBEDO, _LEAST_IRRADIANCE = 0.95, 0.03
 # Cosines to the view between which a surface is too oblique for its pixel to say anything of it.
 _OBLIQUE = (0.1, 0.3)
-# Stops, either way, by which the light's level may be wrong, and how often the light is scaled: a scaled light is only
-# about as bright as asked for.
+# Stops by which the light's level may be wrong, and how often it is scaled, as a scaled light is about as asked for.
 _MOST_STOPS, _SCALINGS = 3.0, 3
 # Pixels of the working image: from the outline of the head to where the detail begins and to where it is whole, as
 # pixels on the outline show the background too; and by which the layers go on beyond it, for lookups between pixels.
@@ -83,8 +81,9 @@ class DetailProblem:
         near[find_near_landmarks(surface.portrait.landmarks, BARE_SKIN, surface.portrait.mask > 0.5)] = True
         chosen = np.flatnonzero(near[surface.points.row, surface.points.column])
         points, radiance = surface.points[chosen], surface.radiance[:, chosen]
+        tone = np.exp(self.avatar.skin_prior().tone_of_luminance(np.array([surface.skin.luminance])))[:, 0]
         for _ in range(_SCALINGS):
-            factor = find_light_factor(radiance, *self._shade(state, points), surface.skin.luminance)
+            factor = find_light_factors(radiance, *self._shade(state, points), tone)
             light = scale_light(self.avatar, state.avatar["illumination"], factor)
             state = state.with_parameters({"illumination": light})
         return state
@@ -114,18 +113,22 @@ class DetailProblem:
         return network
 
 
-def find_light_factor(radiance: np.ndarray, irradiance: np.ndarray, specular: np.ndarray, luminance: float) -> float:
-    """The factor of a light, with irradiance over π and specular radiance [3, n], at which the albedo of skin of that
-    radiance [3, n] has this luminance in the median; 1 where there is no skin, or none within 3 stops."""
+def find_light_factors(
+    radiance: np.ndarray, irradiance: np.ndarray, specular: np.ndarray, tone: np.ndarray
+) -> np.ndarray:
+    """The factors [3] of a light, with irradiance over π and specular radiance [3, n], at which the albedo of skin of
+    that radiance [3, n] is the `tone` [3] in the median; 1 where there is no skin, or no such factor within 3 stops."""
 
-    def excess(stops: float) -> float:
+    def excess(stops: float, channel: int) -> float:
         light = 2.0**stops
-        albedo = np.maximum(radiance - light * specular, 0) / (light * np.maximum(irradiance, 1e-6))
-        return float(np.median(np.array(LUMINANCE) @ albedo)) - luminance
+        reflected = np.maximum(radiance[channel] - light * specular[channel], 0)
+        return float(np.median(reflected / (light * np.maximum(irradiance[channel], 1e-6)))) - tone[channel]
 
-    if not radiance.size or not excess(-_MOST_STOPS) > 0 > excess(_MOST_STOPS):
-        return 1.0
-    return float(2.0 ** brentq(excess, -_MOST_STOPS, _MOST_STOPS, xtol=1e-3))
+    factors = np.ones(3)
+    for channel in range(3 if radiance.size else 0):
+        if excess(-_MOST_STOPS, channel) > 0 > excess(_MOST_STOPS, channel):
+            factors[channel] = 2.0 ** brentq(excess, -_MOST_STOPS, _MOST_STOPS, (channel,), xtol=1e-3)
+    return factors
 
 
 def draw_detail(surface: PhotoSurface, irradiance: np.ndarray, specular: np.ndarray) -> dict[str, np.ndarray]:

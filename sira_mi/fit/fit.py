@@ -272,9 +272,7 @@ def write_folder(
     write_png(out / "contact.png", output.draw_contact_sheet(str(avatar_path), portrait, layers, settings.voxel))
 
     inside = portrait.mask * (layers["mask"] > 0.99)
-    eq_8 = layers["diffuse"] + layers["specular"]
     report["psnr_inside_mask_db"] = round(psnr_inside(layers["final"], portrait.image, inside), 2)
-    report["psnr_of_unrefined_light_db"] = round(psnr_inside(eq_8, portrait.image, inside), 2)
     report["camera"] = portrait.camera.to_dict()
     report["window"] = portrait.window
     report["exposure"] = portrait.exposure

@@ -79,15 +79,8 @@ def evaluate_polynomial(direction: np.ndarray) -> np.ndarray:
 def find_view_direction(face: Face, mean: np.ndarray) -> np.ndarray:
     """Yaw and pitch [2] of the viewing direction in the frame of the `mean` face [468, 3], radians, from the rigid
     parts of the face. They do not depend on the roll of the photo."""
-    x, y, z = _rotation(face, mean)[:, 2]
+    x, y, z = find_rotation(face, mean)[:, 2]
     return np.array([np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))])
-
-
-def align_face(face: Face, mean: np.ndarray) -> np.ndarray:
-    """The network's landmarks with their depth [468, 3], in face sizes about their centre, turned to the `mean` face
-    [468, 3]."""
-    points = np.column_stack([face.landmarks, face.depth]) / face.size
-    return (points - points.mean(axis=0)) @ _rotation(face, mean).T
 
 
 def find_upright_axes(face: Face) -> np.ndarray:
@@ -96,7 +89,7 @@ def find_upright_axes(face: Face) -> np.ndarray:
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
-def _rotation(face: Face, mean: np.ndarray) -> np.ndarray:
+def find_rotation(face: Face, mean: np.ndarray) -> np.ndarray:
     """[3, 3] from the photo's axes to those of the mean face: least squares over the rigid parts."""
     rigid = list(RIGID)
     points = np.column_stack([face.landmarks, face.depth])[rigid]

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from studies.initial_lobes import initial_lobes
 from studies.numerics.fit_cosine_integral import hemisphere_quadrature
 from studies.numerics.specular_quadrature import grid_integrals, integrals, views
 
@@ -160,7 +161,7 @@ def print_diffuse_table() -> None:
 
 def print_timing_table() -> None:
     """Prints the time of `shade`, forward and with its gradients, the kernels compiled before."""
-    from sira_mi.sg import lobes, shading
+    from sira_mi.sg import shading
 
     print(f"\nTime of `shade` per million points ({TIMED_POINTS} points timed, least of 5; {os.cpu_count()} cores)")
     print("| lobes | forward, s | forward and gradients of all inputs, s |")
@@ -174,7 +175,7 @@ def print_timing_table() -> None:
         forward, both = [], []
         for _ in range(5):
             point = mi.Vector3f(normal), mi.Vector3f(view), mi.Float(albedo), mi.Float(roughness)
-            inputs = (*point, mi.TensorXf(lobes.initial_lobes(count)))
+            inputs = (*point, mi.TensorXf(initial_lobes(count)))
             dr.eval(inputs)
             dr.sync_thread()
             start = time.perf_counter()

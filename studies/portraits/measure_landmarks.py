@@ -12,9 +12,9 @@ from sira_mi.portrait.face import Face, find_faces
 from sira_mi.portrait.head_landmarks import (
     TERMS,
     LandmarkCorrection,
-    align_face,
     correct_landmarks,
     evaluate_polynomial,
+    find_rotation,
     find_upright_axes,
     find_view_direction,
 )
@@ -106,3 +106,10 @@ def measure_held_out_errors(observations: list[Observation]) -> tuple[float, flo
 
 def _distance(observation: Observation, landmarks: np.ndarray) -> float:
     return float(np.nanmean(np.linalg.norm(landmarks - observation.true, axis=1)) / observation.face.size)
+
+
+def align_face(face: Face, mean: np.ndarray) -> np.ndarray:
+    """The network's landmarks with their depth [468, 3], in face sizes about their centre, turned to the `mean` face
+    [468, 3]."""
+    points = np.column_stack([face.landmarks, face.depth]) / face.size
+    return (points - points.mean(axis=0)) @ find_rotation(face, mean).T

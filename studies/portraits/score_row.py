@@ -11,12 +11,12 @@ import numpy as np
 from PIL import Image
 
 from sira_mi.avatar.file import PRIOR, load_avatar
-from sira_mi.avatar.landmark_model import landmarks_of
 from sira_mi.avatar.shape import HeadShape
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.files import read_exr, read_json
 from sira_mi.portrait.camera import Camera
+from studies.head_landmarks import landmarks_of
 from studies.portraits.appearance_scores import PredictedAppearance, score_appearance, score_tone
 from studies.portraits.geometry_scores import PredictedHead, TrueSurface, score_geometry, true_surface
 from studies.portraits.photo_frame import read_frame

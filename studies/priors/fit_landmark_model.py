@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sira_mi.avatar.file import LANDMARK_MODEL, Avatar
-from sira_mi.avatar.landmark_model import LandmarkModel, landmarks_of
+from sira_mi.avatar.landmark_model import LandmarkModel
 from sira_mi.conventions import MILLIMETRES_PER_UNIT
 from sira_mi.errors import InputError
 from sira_mi.fields.columns import to_array
 from sira_mi.training.scenes import TrainingScene
 from sira_mi.training.shape_model import ShapeModel
+from studies.head_landmarks import landmarks_of
 from studies.priors.landmark_regression import landmark_tensors
 from studies.priors.shape_measures import ShapeFit, fit_shape
 

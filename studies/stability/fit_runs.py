@@ -101,7 +101,6 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
     import trimesh
 
     from sira_mi.avatar.file import load_avatar, save_avatar
-    from sira_mi.avatar.landmark_model import landmarks_of
     from sira_mi.colour import linear_to_srgb
     from sira_mi.fit import output
     from sira_mi.fit.driver import Progress
@@ -111,6 +110,7 @@ def _fit_and_score(fit: Fit, given: CorruptInput, truth: "Truth", picture: Path,
     from sira_mi.portrait.camera import Camera
     from sira_mi.portrait.portrait import area_resample
     from sira_mi.relight.pictures import psnr_inside
+    from studies.head_landmarks import landmarks_of
     from studies.portraits.geometry_scores import GeometrySettings, PredictedHead, score_geometry
 
     settings = fit.find_case().settings
