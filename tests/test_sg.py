@@ -21,6 +21,7 @@ from sira_mi.sg import fit_environment as fit  # noqa: E402
 from studies.data import read_figures  # noqa: E402
 from studies.initial_lobes import initial_lobes  # noqa: E402
 from studies.numerics import physg, worst_errors  # noqa: E402
+from studies.stability.spherical_gaussians import inner_product  # noqa: E402
 
 SHARPNESS = np.geomspace(1e-3, 1e5, 33)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(500)
@@ -120,7 +121,7 @@ def test_product_and_inner_product_match_float64():
     exponent = -a * b * ((axes[0] - axes[1]) ** 2).sum(axis=1) / (joint + a + b)
     exact = np.exp(exponent) * -2 * np.pi * np.expm1(-2 * joint) / joint
     vectors = [mi.Vector3f(x.T) for x in axes]
-    value = integrals.inner_product(vectors[0], mi.Float(a), vectors[1], mi.Float(b)).numpy()
+    value = inner_product(vectors[0], mi.Float(a), vectors[1], mi.Float(b)).numpy()
     assert np.isfinite(value).all()
     np.testing.assert_allclose(value, exact, rtol=3e-3, atol=1e-7)
     # The product of the functions is the function of the product, in any direction.

@@ -116,12 +116,6 @@ def product(
     return dr.fma(mean, excess, mean), sharpness, log_amplitude
 
 
-def inner_product(axis_a: Vector3f, sharpness_a: Float, axis_b: Vector3f, sharpness_b: Float) -> Float:
-    """∫ of the product of two lobes of amplitude 1 over the sphere, steradians."""
-    _, sharpness, log_amplitude = product(axis_a, sharpness_a, axis_b, sharpness_b)
-    return dr.exp(log_amplitude) * sphere_integral(sharpness)
-
-
 def hemisphere_integral(cosine: Float, sharpness: Float) -> Float:
     """∫ exp(λ(ω·ξ − 1)) dω over the hemisphere around n, steradians, for `cosine` = ξ·n in [−1, 1]."""
     ratio = _even_polynomial(cosine, sharpness, _STEP_HALF_POINT, _STEP_RATIO)
