@@ -113,16 +113,14 @@ class DetailProblem:
         return network
 
 
-def find_light_factors(
-    radiance: np.ndarray, irradiance: np.ndarray, specular: np.ndarray, tone: np.ndarray
-) -> np.ndarray:
-    """The factors [3] of a light, with irradiance over π and specular radiance [3, n], at which the albedo of skin of
-    that radiance [3, n] is the `tone` [3] in the median; 1 where there is no skin, or no such factor within 3 stops."""
+def find_light_factors(radiance: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, tone: np.ndarray) -> np.ndarray:
+    """The factors [3] of a light, with `diffuse` irradiance over π and specular radiance [3, n], at which skin of that
+    radiance [3, n] has the albedo `tone` [3] in the median; 1 without skin, or where no factor within 3 stops does."""
 
     def excess(stops: float, channel: int) -> float:
         light = 2.0**stops
         reflected = np.maximum(radiance[channel] - light * specular[channel], 0)
-        return float(np.median(reflected / (light * np.maximum(irradiance[channel], 1e-6)))) - tone[channel]
+        return float(np.median(reflected / (light * np.maximum(diffuse[channel], 1e-6)))) - tone[channel]
 
     factors = np.ones(3)
     for channel in range(3 if radiance.size else 0):
