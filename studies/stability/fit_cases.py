@@ -43,7 +43,7 @@ SETTINGS = replace(
     voxel=0.12,
     final_voxel=0.1,
     block=10,
-    stages=tuple(replace(stage, steps=_STEPS[stage.name]) for stage in QUALITIES["standard"].stages),
+    stages=tuple(replace(s, steps=_STEPS.get(s.name, 0)) for s in QUALITIES["standard"].stages),
 )
 REACH = 10  # pixels of the photo by which masks are eroded and dilated
 _HOLES, _HOLE_RADIUS = 12, 18  # number, and pixels
