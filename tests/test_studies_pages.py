@@ -1,6 +1,7 @@
 """The pages of the studies are their figures put into a template: nothing on them is typed by hand or says more than
 the figures do."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -143,14 +144,12 @@ def test_the_page_has_a_line_for_each_row_that_was_measured(figures):
 
 
 def test_the_page_shows_what_it_is_given(figures):
-    figures["ladder"] = [
-        {"name": "true camera", "psnr": 20.44, "ssim": 0.7, "face": 1.2, "delta": 0.4},
-        {"name": "all"},
-    ]
+    figures["rows"]["true-all"] = {**figures["rows"]["draft"], "title": "fit, draft, all of these true"}
     figures["stranger"] = [{"title": "fit, draft", "by": "a person", "right": 7, "of": 10}]
     figures["pictures"] = {"rows": "Some portraits."}
     text = page.render_page(figures, figures)
-    assert "| true camera | 20.4 | 0.700 | 1.20 | 0.4 |\n| all | – | – | – | – |" in text
+    assert "| fit, draft, all of these true |" in text.split("## The ladder")[1].split("## Heads of")[0]
+    assert "all of these true" not in text.split("## The ladder")[0]
     assert "| fit, draft | a person | 7 of 10 |" in text
     assert "Some portraits.\n\n![" in text and "images/results_worst.jpg" not in text
     assert "| fit, draft | 4 | 21.5 |" in text.split("## Heads of the training's generators")[1]
@@ -172,12 +171,10 @@ def test_figures_say_when_they_were_measured(figures, tmp_path):
 
 def test_notes_are_put_into_the_figures(figures, tmp_path):
     """Figures stay as they were measured; a list of another name is refused."""
-    (tmp_path / "notes.json").write_text('{"ladder": [{"name": "true pose", "psnr": 21.0}]}')
+    stranger = [{"title": "fit, draft", "by": "a person", "right": 7, "of": 10}]
+    (tmp_path / "notes.json").write_text(json.dumps({"stranger": stranger}))
     write_notes(tmp_path / "notes.json", tmp_path)
-    assert read_figures(tmp_path / page.FIGURES["foreign"]) == {
-        **figures,
-        "ladder": [{"name": "true pose", "psnr": 21}],
-    }
+    assert read_figures(tmp_path / page.FIGURES["foreign"]) == {**figures, "stranger": stranger}
     (tmp_path / "notes.json").write_text('{"rows": []}')
-    with pytest.raises(InputError, match="lists ladder and stranger alone"):
+    with pytest.raises(InputError, match="lists stranger alone"):
         write_notes(tmp_path / "notes.json", tmp_path)

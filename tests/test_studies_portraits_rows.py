@@ -318,10 +318,11 @@ def test_fit_score_and_page_make_a_table_of_the_rows(case, commands, monkeypatch
     (row,) = json.loads((case.runs / "draft" / "rows.json").read_text())
     assert row["wall_seconds"] == 2 and row["scores"]["relit_1_psnr"] > 5
     out = tmp_path / "docs"
-    write_figures(out / "data" / "foreign.json", {"ladder": [{"name": "all", "psnr": 30.0}], "rows": {}})
+    stranger = {"title": "fit, draft", "by": "a person", "right": 7, "of": 10}
+    write_figures(out / "data" / "foreign.json", {"stranger": [stranger], "rows": {}})
     run_studies(monkeypatch, capsys, case, "page", "--half", "choice", "--out", str(out))
     text = (out / "results.md").read_text()
-    assert "| fit, draft | 1 |" in text and "| all | 30.0 |" in text and "images/results_worst.jpg" in text
+    assert "| fit, draft | 1 |" in text and "| 7 of 10 |" in text and "images/results_worst.jpg" in text
     with pytest.raises(InputError, match="no portraits of the half report"):
         run_studies(monkeypatch, capsys, case, "fit", "--half", "report")
 

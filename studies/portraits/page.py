@@ -11,11 +11,12 @@ from sira_mi.files import write_text
 from studies.data import read_figures
 from studies.markdown import number, table
 from studies.portraits.relit_scores import SHARES
+from studies.portraits.rows import RUNGS
 
 FIGURES = {kind: Path("data") / f"{kind}.json" for kind in ("foreign", "own")}  # beside the page
 PICTURES = {"rows": Path("images") / "results.jpg", "worst": Path("images") / "results_worst.jpg"}
 TEMPLATE = Path(__file__).with_name("template.md")
-NOTES = ("ladder", "stranger")  # parts of the figures of `foreign` that are given, not measured by the page
+NOTES = ("stranger",)  # parts of the figures of `foreign` that are given, not measured by the page
 NOT_MEASURED = "Not measured yet."
 
 
@@ -131,7 +132,10 @@ COSTS = (
     Column("pictures, s", ("relight_cpu_seconds",), 0),
     Column("memory, GB", ("peak_memory_megabytes",), 1, 1e-3),
 )
-LADDER = {"psnr": ("relit, dB", 1), "ssim": ("SSIM", 3), "face": ("face, mm", 2), "delta": ("change, dB", 1)}
+LADDER = (
+    *_scores("mean", ("relit, dB", "relit_psnr", 1), ("SSIM", "relit_ssim", 3), ("turned, dB", "turned_psnr", 1)),
+    *_scores("to_draft", ("to draft, dB", "relit_psnr", 1), ("SSIM", "relit_ssim", 3)),
+)
 
 
 def find(figures: Mapping, *path: str) -> Any:
@@ -156,7 +160,9 @@ def write_page(out: Path) -> Path:
 def render_page(foreign: dict | None, own: dict | None) -> str:
     """The page's Markdown from the figures of both benchmarks; None for one that is not measured."""
     shown = foreign or {"portraits": 0, "identities": 0, "rows": {}, "groups": {}, "failed": [], "measured": {}}
-    rows = shown["rows"]
+    rows = {name: row for name, row in shown["rows"].items() if name not in RUNGS}
+    ladder = {name: row for name, row in shown["rows"].items() if name in RUNGS}
+    shown = {**shown, "rows": rows}
     return Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
         what=_describe(shown),
         revision=find(shown, "measured", "revision") or "–",
@@ -170,7 +176,7 @@ def render_page(foreign: dict | None, own: dict | None) -> str:
         groups_face=_groups(shown, "h3ds_face_mean", 2),
         geometry=render_table(rows, GEOMETRY),
         appearance=render_table(rows, APPEARANCE),
-        ladder=_ladder(shown.get("ladder", [])) + _strangers(shown.get("stranger", [])),
+        ladder=_ladder(ladder) + _strangers(shown.get("stranger", [])),
         cost=render_table(rows, COSTS),
         own=_own(own),
         failed=_failed([*shown["failed"], *(own["failed"] if own else [])]),
@@ -219,15 +225,13 @@ def _own(own: dict | None) -> str:
     )
 
 
-def _ladder(steps: Sequence[Mapping]) -> str:
-    """Dicts of `name` and the keys of `LADDER`."""
-    if not steps:
+def _ladder(rows: Mapping[str, dict]) -> str:
+    """The rows of `studies.portraits.ladder`."""
+    if not rows:
         return ""
-    lines = [[step["name"], *(number(step.get(key), digits) for key, (_, digits) in LADDER.items())] for step in steps]
     return (
-        "\n## The ladder\n\n"
-        + table(("", *(title for title, _ in LADDER.values())), lines)
-        + "\n\nOne estimated thing at a time replaced by its truth, then all: what each is worth, and the ceiling.\n"
+        f"\n## The ladder\n\n{render_table(rows, LADDER)}\n\nA draft with one estimated thing at a time replaced by "
+        "its truth, then with all: what each is worth, and the ceiling.\n"
     )
 
 

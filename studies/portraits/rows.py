@@ -115,6 +115,22 @@ def _picture(name: str, *options: str) -> tuple[str, ...]:
 
 
 _NORMALS = ("--head", "{before}")
+# Of a draft, by `studies.portraits.ladder`: the rung and what is true in it.
+LADDER = {
+    "outline": "the outline true",
+    "tone": "the tone of the skin true",
+    "light": "the light of the photo true",
+    "albedo": "the albedo true",
+    "shape": "shape, pose and camera true",
+    "all": "all of these true",
+}
+
+
+def _rung(name: str) -> Row:
+    request = ("-m", "studies.portraits.ladder", name, "--truth", "{truth}", "--fit", "{before}", "--out", "{row}")
+    command = (*request, "--lights", "{light_1}", "{light_2}", "--variant", "{variant}")
+    return Row(f"true-{name}", f"fit, draft, {LADDER[name]}", command, "draft", False)
+
 
 ROWS = (
     Row("photo", "the photo unchanged", _picture("photo"), has_avatar=False),
@@ -138,6 +154,7 @@ ROWS = (
     Row("draft", "fit, draft", _fit("--quality", "draft")),
     Row("standard", "fit, standard", _fit("--quality", "standard")),
     Row("draft-camera", "fit, draft, camera known", _fit("--quality", "draft", "--camera", "{camera}")),
+    *map(_rung, LADDER),
     *(
         Row(
             "paper" if method.name == PAPER else method.name,
@@ -149,6 +166,7 @@ ROWS = (
     ),
 )
 BY_NAME = {row.name: row for row in ROWS}
+RUNGS = frozenset(f"true-{name}" for name in LADDER)
 
 
 def select_rows(names: Sequence[str]) -> list[Row]:

@@ -26,9 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--benchmark", type=Path, help="folder of build")
     parser.add_argument("--runs", type=Path, help="folder of the rows, a folder each")
     parser.add_argument("--worst-of", default="draft", metavar="ROW", help="row whose worst portraits are shown")
-    parser.add_argument(
-        "--notes", type=Path, metavar="JSON", help="`ladder` and `stranger`, for the figures of foreign"
-    )
+    parser.add_argument("--notes", type=Path, metavar="JSON", help="`stranger`, for the figures of foreign")
     add_selection(parser)
     parser.set_defaults(half="report")
 
