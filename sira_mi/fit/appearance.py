@@ -108,7 +108,7 @@ class AppearanceProblem:
 
     def refresh(self, state: FitState) -> None:
         """Makes arrays of all of the avatar's parameters, those that the stage holds fixed included."""
-        self._fixed = {name: mi.Float(value) for name, value in state.avatar.items()}
+        self._fixed = state.floats()
         base_at = state.avatar["diffuse_albedo"], state.avatar["z_a"]
         if not self._base_at or not all(map(np.array_equal, self._base_at, base_at)):
             self._base_at, self._base = base_at, None

@@ -19,7 +19,6 @@ from scipy.optimize import brentq
 from scipy.special import logit
 
 from sira_mi.avatar.decoders import albedo_refinement, refine_albedo
-from sira_mi.avatar.file import Avatar
 from sira_mi.fields.columns import CHUNK
 from sira_mi.fit.appearance import PhotoSurface, scale_light, share_surface
 from sira_mi.fit.shaded import Arrays, PhotoPoints, base_albedo, decoder, shade_points
@@ -90,7 +89,7 @@ class DetailProblem:
 
     def _shade(self, state: FitState, points: PhotoPoints) -> tuple[np.ndarray, np.ndarray]:
         """Irradiance over π and specular radiance [3, n] at points of the photo."""
-        parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
+        parameters = state.floats()
         pieces = np.array_split(np.arange(len(points.row)), max(1, -(-len(points.row) // CHUNK)))
         found = []
         for index in pieces:
@@ -107,7 +106,10 @@ class DetailProblem:
         chosen = facing[:: max(1, -(-len(facing) // CHUNK))]
         network = state.avatar["diffuse_albedo"].copy()
         if len(chosen):
-            albedo = _refined_albedo(self.avatar, state, points[chosen], self.stage.k_r)
+            at, parameters, octaves = points[chosen], state.floats(), self.avatar.architecture.refinement_octaves
+            refinement = decoder(self.avatar, "albedo_refinement", parameters)
+            fine = albedo_refinement(refinement, octaves, mi.TensorXf(at.x_ref), mi.TensorXf(at.gamma))
+            albedo = refine_albedo(base_albedo(self.avatar, parameters, at), fine, self.stage.k_r).numpy()
             wanted, known = (logit(np.clip(a, 1e-3, _HIGHEST_ALBEDO)) for a in (seen[:, chosen], albedo))
             network[-3:] += np.median(wanted - known, axis=1).astype(np.float32)
         return network
@@ -149,14 +151,6 @@ def draw_detail(surface: PhotoSurface, irradiance: np.ndarray, specular: np.ndar
         "detail_depth": depth,
         "detail_camera": (to_unit @ camera.K @ camera.world_to_camera[:3]).astype(np.float32),
     }
-
-
-def _refined_albedo(avatar: Avatar, state: FitState, points: PhotoPoints, k_r: float) -> np.ndarray:
-    """The networks' diffuse albedo [3, N]."""
-    parameters = {name: mi.Float(value) for name, value in state.avatar.items()}
-    network, octaves = decoder(avatar, "albedo_refinement", parameters), avatar.architecture.refinement_octaves
-    fine = albedo_refinement(network, octaves, mi.TensorXf(points.x_ref), mi.TensorXf(points.gamma))
-    return refine_albedo(base_albedo(avatar, parameters, points), fine, k_r).numpy()
 
 
 def _facing(points: PhotoPoints) -> np.ndarray:

@@ -224,7 +224,7 @@ def measure_polish(task: FitTask, stage: PolishStage, state: FitState) -> dict[s
     parameters = mi.traverse(scene)
     gain: dict[str, list[float]] = {f"{name}_psnr_db": [] for name, _, _ in pictures}
     for one in (state.before_polish(), state):
-        floats = {name: mi.Float(value) for name, value in one.avatar.items()}
+        floats = one.floats()
         parameters["head.bsdf.diffuse_albedo.refinement"] = floats["albedo_refinement"]
         parameters["head.bsdf.specular_albedo.latent"] = floats["z_s"]
         parameters["light.lobes"] = decode_lobes(avatar, floats)

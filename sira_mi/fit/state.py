@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from sira_mi.avatar.file import Avatar
@@ -16,7 +18,7 @@ class FitState:
     """Everything that a fit has found so far. Its parameters, which stages optimise by name, are those of the avatar
     and `pose`."""
 
-    avatar: dict[str, np.ndarray]  # the avatar's networks [parameters] and latent codes [dimension]
+    avatar: dict[str, np.ndarray]  # the avatar's networks [parameters], latent codes [dimension] and detail
     # Rotation vector (radians) and translation (scene units) [6] of points before they enter the field.
     pose: np.ndarray = field(default_factory=lambda: np.zeros(6, np.float32))
     unpolished: dict[str, np.ndarray] | None = None  # the parameters that the polish moves, as they were before it
@@ -35,6 +37,10 @@ class FitState:
         """The same state with some parameters replaced or added."""
         avatar = {name: value for name, value in values.items() if name != POSE}
         return replace(self, avatar={**self.avatar, **avatar}, pose=values.get(POSE, self.pose))
+
+    def floats(self) -> dict[str, Any]:
+        """The avatar's networks and latent codes as Floats."""
+        return {name: mi.Float(value) for name, value in self.avatar.items() if value.ndim == 1}
 
     def before_polish(self) -> FitState:
         """The state before its polish; itself where that has not begun."""
