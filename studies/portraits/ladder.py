@@ -1,4 +1,4 @@
-"""`python -m studies.portraits.ladder RUNG PHOTO …`: the pictures of a fit in which one estimated thing is replaced by
+"""`python -m studies.portraits.ladder RUNG …`: the pictures of a fit in which one estimated thing is replaced by
 its truth.
 
 `outline` fills what the fit's pictures miss of the head with the true pictures. `tone` scales the fit's albedo to the
